@@ -66,7 +66,7 @@ def kinds_of(
 def _chosen(
     role: str, arguments: Sequence[str], folder: str | None, stored: dict[str, Any] | None
 ) -> str | None:
-    given = [a.partition("=") for a in arguments]
+    given = [a.partition("=") for a in arguments if "=" in a]
     exact = [value for name, _, value in given if name.lstrip("+") == f"{role}.{KIND}"]
     if exact:
         return unquoted(exact[-1])

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 
 from conf.cli import entry, tell
 from conf.commands import Plain
-from tangram_core.registry import AGENT, SHA256, TASK
+from tangram_core.errors import ConfigError, TangramError
+from tangram_core.registry import AGENT, KIND, SHA256, TASK
+from tangram_core.run.code import where
 from tangram_core.run.process import VARIABLE
 
 if TYPE_CHECKING:
@@ -111,11 +113,17 @@ def _hold_own_code(setup: "Setup") -> None:
         return
     from tangram_core.conformance import check_agent, check_task
 
-    tell(f"plays a little with {' and '.join(own)} of your own")
-    if TASK in own:
-        check_task(setup.task)
-    if AGENT in own:
-        check_agent(setup.agent, setup.task)
+    tell(f"plays and learns a little with {' and '.join(own)} of your own")
+    try:
+        if TASK in own:
+            check_task(setup.task)
+        if AGENT in own:
+            check_agent(setup.agent, setup.task)
+    except TangramError:
+        raise
+    except Exception as error:  # it is the user's code: anything may go wrong
+        named = ", ".join(f"{role}={setup.kinds[role][KIND]}" for role in own)
+        raise ConfigError(f"{named} failed: {where(error)}: mend it") from error
 
 
 def _make_absolute(settings: Plain) -> None:

@@ -117,6 +117,9 @@ def play(task: Task, env: Env, generators: Generators, act: Act) -> Played:
     arrays = dict(spec.empty(count).arrays)
     seen = env.reset(generators)
     _check_seen(env, "reset", seen, [f for f in spec.fields if f.per != "step"])
+    paid = np.asarray(task.rewards(seen[spec.achieved], seen[spec.desired]))
+    if paid.shape != (count,):
+        _fail(task, "rewards", f"shape ({count},) for {count} goals", paid.shape)
     facts = [_copied(env.facts())]
     for t in range(spec.horizon + 1):
         for field in spec.fields:
@@ -165,8 +168,8 @@ def _check_array(owner: object, method: str, field: Field, array: Array, count: 
     wanted = (count, *field.shape)
     # What is more exact is rounded when it is kept, and a flag is a number.
     if array.shape != wanted or array.dtype not in (field.dtype, *_AS_GOOD[field.dtype]):
-        came = f"{array.dtype.str} {array.shape}"
-        _fail(owner, method, f"{field.name} to be {field.dtype} {wanted}", came)
+        came = f"{array.dtype} {array.shape}"
+        _fail(owner, method, f"{field.name} to be {np.dtype(field.dtype)} {wanted}", came)
     if not ((field.low <= array) & (array <= field.high)).all():  # nor is a NaN
         came = f"{array.min():g} to {array.max():g}"
         _fail(owner, method, f"{field.name} within {field.low:g} and {field.high:g}", came)
@@ -222,7 +225,8 @@ def _check_rivals(task: Task, env: Env, count: int) -> None:
 
 def _watched(task: Task, method: str, act: Act) -> Act:
     def watched(seen: Arrays, past: History, generators: Generators) -> Singles:
-        return _checked_actions(task, method, act(seen, past, generators), len(generators))
+        found = act(seen, past, generators)
+        return _checked_actions(task, task, method, found, len(generators))
 
     return watched
 
@@ -251,7 +255,7 @@ def _check_acting(agent: Agent, task: Task, learner: Learner) -> None:
             size = len(range(count)[rows])
             past = History(moments, np.zeros((size, 0, task.spec.action_size), np.float32))
             rng = _generators(count)[rows] if explores else None
-            return _checked_actions(actor, "act", actor.act(own, past, rng), size)
+            return _checked_actions(task, actor, "act", actor.act(own, past, rng), size)
 
         whole = act(slice(None))
         if not np.array_equal(whole, act(slice(None))):
@@ -308,10 +312,11 @@ def _refuses(owner: object, method: str, act: Callable[[], object]) -> None:
     _fail(owner, method, "RunError", "none")
 
 
-def _checked_actions(owner: object, method: str, actions: Singles, count: int) -> Singles:
-    field = owner.spec.field(ACTIONS) if isinstance(owner, Task) else None
-    size = field.shape[0] if field else actions.shape[-1]
-    _check_array(owner, method, Field(ACTIONS, (size,), -1.0, 1.0, "step"), actions, count)
+def _checked_actions(
+    task: Task, owner: object, method: str, actions: Singles, count: int
+) -> Singles:
+    field = Field(ACTIONS, (task.spec.action_size,), -1.0, 1.0, "step")
+    _check_array(owner, method, field, actions, count)
     return actions
 
 

@@ -5,7 +5,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from tangram_agent.base.config import LearningConfig
 from tangram_agent.nets.networks import initialise, parameter_count
 from tangram_agent.nets.weights import load_arrays, to_arrays, under
 from tangram_core.agent import Learner, NotFiniteError, Streams, Tensors
-from tangram_core.errors import RunError
+from tangram_core.errors import ConfigError, RunError
 from tangram_core.spec import Array, Arrays
 
 _COUNTER = "updates"
@@ -101,6 +101,9 @@ class NetworkLearner(Learner):
             compiled: whether an update is compiled as a whole, see `Compiled`.
             others: networks that are fitted otherwise.
         """
+        for name in targets:
+            if name not in learned:
+                self._refuse("target_names", f"'{name}'", f"names of {', '.join(learned)}")
         self.targets = {name: frozen(learned[name]) for name in targets}
         following = {f"target_{name}": module for name, module in self.targets.items()}
         self.parts: dict[str, nn.Module] = {**learned, **following, **(others or {})}
@@ -172,12 +175,20 @@ class NetworkLearner(Learner):
             listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
             raise NotFiniteError(f"update {self.updates + 1} is not finite ({listed})")
         self.updates += 1
+        if self.updates == self.delay:  # each form of an update was made once
+            named = {name for names in self._names.values() for name in names}
+            for name in self.optimisers:
+                if f"{name}_loss" not in named:
+                    self._refuse(
+                        "losses", f"none of '{name}'", "a Loss of each network that learns"
+                    )
         return numbers
 
     def step(self, seen: Any, rates: Rates) -> Tensor:
         """The whole update, on the device alone; its numbers, by the names in `_names`."""
         numbers: dict[str, Tensor] = {}
         for loss in self.losses(seen):
+            self._check(loss)
             rate = rates.actor if loss.part == "actor" else rates.critic
             gradients = torch.autograd.grad(loss.value, self.lists[loss.part])
             norm = gradient_norm(gradients, traced=isinstance(rate, Tensor))
@@ -187,6 +198,18 @@ class NetworkLearner(Learner):
         self.follow(rates)
         self._names[getattr(seen, "acts", True)] = tuple(numbers)
         return torch.stack([one.detach() for one in numbers.values()])
+
+    def _check(self, loss: Loss) -> None:
+        """Refuse a loss of no network, or what is no single number."""
+        if loss.part not in self.optimisers:
+            known = ", ".join(self.optimisers)
+            self._refuse("losses", f"a Loss of '{loss.part}'", f"one of {known}")
+        for name, value in {f"a Loss of '{loss.part}'": loss.value, **loss.told}.items():
+            if value.ndim:
+                self._refuse("losses", f"{name} of shape {tuple(value.shape)}", "a single number")
+
+    def _refuse(self, method: str, came: str, wanted: str) -> NoReturn:
+        raise ConfigError(f"{type(self).__name__}.{method}: wanted {wanted}, got {came}")
 
     def prepare(self) -> None:
         """Compile updates that are to be compiled: else the first ones take a minute."""

@@ -7,6 +7,7 @@ where a command line, or a program, names it itself.
 import hashlib
 import re
 import sys
+import traceback
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -20,6 +21,7 @@ NAMES = {"task": ("task", "kind"), "agent": ("agent", "kind"), "reward.name": ("
 KNOWN = ("gymnasium_robotics", "panda_gym")  # modules of the extra `robotics`
 
 _named = set[str]()  # modules
+_files = set[Path]()  # that were loaded
 
 
 def own_code(name: str) -> tuple[Path, str] | None:
@@ -113,14 +115,26 @@ def load_code(setting: str, given: str, path: Path, name: str, source: bytes) ->
     # found by this name, and two files with one name do not meet.
     module = ModuleType(f"_tangram_own_{hashlib.sha256(source).hexdigest()[:16]}")
     module.__file__ = str(path)
+    _files.add(path)
     sys.modules[module.__name__] = module
     try:
         exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102
-    except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
+    except ImportError as error:
         raise ConfigError(
             f"{setting}={given}: cannot load '{path}' ({type(error).__name__}: {error}): it must "
             "be one file that needs nothing but installed packages"
         ) from error
+    except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
+        raise ConfigError(f"{setting}={given}: cannot load it: {where(error)}: mend it") from error
     if not hasattr(module, name):
         raise ConfigError(f"{setting}={given}: '{path}' has no '{name}'")
     return getattr(module, name)
+
+
+def where(error: BaseException) -> str:
+    """An exception of a user's code in one line, with the place in it, where it passed there."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [one for one in frames if Path(one.filename) in _files] or frames
+    line = " ".join(f"{type(error).__name__}: {error}".split())
+    place = f"{own[-1].filename}, line {own[-1].lineno}, in {own[-1].name}"
+    return f"{line} ({place})"
