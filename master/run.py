@@ -130,14 +130,8 @@ def open_run(
 ) -> tuple[Loop, dict[str, Any]]:
     """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
 
-    Args:
-        config: the master's settings.
-        setup: the task and the agent.
-        claim: of the run's folder, which is prepared.
-        progress: for the user.
-        signals: that end the run.
-        watchdog: hears of every batch of the journal, which may take long to read.
-        opened: closes what is opened here.
+    The watchdog hears of every batch of the journal, which may take long to read. What is opened
+    here is closed with `opened`.
 
     Returns:
         The loop, and what a worker needs to find this master and to be let in.
@@ -203,15 +197,7 @@ def open_run(
 def connection_of(
     service: ServiceConfig, hub: Hub, run_id: str, http: str | None, keys: Keys | None
 ) -> dict[str, Any]:
-    """What a worker needs to find this master, and to be let in.
-
-    Args:
-        service: names the host that workers find it under.
-        hub: with its sockets open.
-        run_id: of the run.
-        http: where /metrics and /healthz are, if they are anywhere.
-        keys: where the sockets are encrypted.
-    """
+    """What a worker needs to find this master, and to be let in where there are keys."""
     host = service.host or socket.gethostname()
     announced = with_host if service.host else reachable
     if service.host and (unknown := dns_error(with_host(hub.endpoint, host))):

@@ -35,11 +35,7 @@ _AS_GOOD: dict[str, tuple[Any, ...]] = {"f4": (np.float64,), "u1": (np.bool_,)}
 
 
 def check_task(task: Task, count: int = 3) -> None:
-    """Play a task with random actions, and hold it to `Task` and `Env`.
-
-    Args:
-        task: that can be played on this machine.
-        count: environments side by side.
+    """Play a task with random actions, side by side, and hold it to `Task` and `Env`.
 
     Raises:
         ConformanceError: names the class, the method, what was wanted and what came.
@@ -77,12 +73,7 @@ def check_task(task: Task, count: int = 3) -> None:
 
 
 def check_agent(agent: Agent, task: Task, device: str = "cpu") -> None:
-    """Let an agent play and learn a task, and hold it to `Agent`, `Actor` and `Learner`.
-
-    Args:
-        agent: of small networks and batches.
-        task: that it can play.
-        device: of torch.
+    """Let an agent of small networks play and learn a task; hold it to `Agent`, `Actor`, `Learner`.
 
     Raises:
         ConformanceError: names the class, the method, what was wanted and what came.

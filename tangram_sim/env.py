@@ -75,11 +75,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; a seed fixes this one and all that follow.
-
-        Raises:
-            SamplingError: no layout without overlap was found.
-        """
+        """Begin an episode; a seed fixes this one and all that follow; SamplingError: no room."""
         super().reset(seed=seed, options=options)
         self._table.reset([self.np_random])
         self._show()

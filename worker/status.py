@@ -41,10 +41,7 @@ REFUSED = {
 
 
 def show_status(config: StatusConfig) -> int:
-    """Print the status, or the result of a run that has finished.
-
-    Returns:
-        Exit status 0.
+    """Print the status, or the result of a run that has finished; exit status 0.
 
     Raises:
         TangramError: neither a connection file nor a result, keys that do not fit, or a master
@@ -74,16 +71,7 @@ def _print_result(console: Console, result: Mapping[str, Any], config: StatusCon
 def ask_status(
     connect: str, context: "zmq.Context[zmq.Socket[bytes]]", patience_s: float = PATIENCE_S
 ) -> RunStatus:
-    """The present status of a run.
-
-    Args:
-        connect: host:port, a connection file, or a run folder that holds one.
-        context: of the sockets.
-        patience_s: to wait for the answer.
-
-    Raises:
-        TangramError: see `show_status`.
-    """
+    """The present status of a run, see `find_master` and `show_status`."""
     address = find_master(connect)
     if address is None:
         raise TangramError(f"no connection file at {connect}: {_nobody(Path(connect) / CONFIG)}")

@@ -35,8 +35,6 @@ class Received(NamedTuple):
     """A message, and who it is from.
 
     Attributes:
-        identity: of the connection.
-        frames: of the message.
         holder: of the key that the connection showed, which may be revoked since.
         address: of the other side; of a unix socket `local` and the id of its process.
     """
@@ -48,12 +46,7 @@ class Received(NamedTuple):
 
 
 class Sockets:
-    """A bound ROUTER and a bound PUB.
-
-    Attributes:
-        endpoint: of the ROUTER.
-        weights_endpoint: of the PUB.
-    """
+    """A bound ROUTER, and a bound PUB for weights."""
 
     def __init__(
         self,

@@ -62,13 +62,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Title(Plain):
-    """What a segment is of.
-
-    Attributes:
-        format: of the journal.
-        run_id: of the run.
-        task: digest of what the arrays belong to.
-    """
+    """What a segment is of; the task is a digest of what the arrays belong to."""
 
     kind: ClassVar[str] = "segment"
     format: Count

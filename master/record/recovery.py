@@ -39,11 +39,7 @@ ANOTHER = "choose another run_dir, or delete its folder journal to go on without
 
 
 def journal_run_id(folder: Path) -> str | None:
-    """The run that a journal is of; None where there is no journal, or no title in it.
-
-    Raises:
-        RunError: it is of another format.
-    """
+    """The run that a journal is of; None where there is none. RunError if of another format."""
     return next((title.run_id for _, title in _titles(folder)), None)
 
 
@@ -93,8 +89,7 @@ class Reader:
         Args:
             folder: of the segments.
             after: which a checkpoint names; None for the whole journal.
-            run_id: that the segments must be of.
-            task: digest that they must carry.
+            run_id, task: that the segments must be of.
             spec: of the arrays.
             warn: takes a line for each loss, and for a record that was cut short.
         """
@@ -104,11 +99,7 @@ class Reader:
         self._trouble: _Trouble | None = None
 
     def __iter__(self) -> Iterator[EpisodesArrived]:
-        """Read.
-
-        Raises:
-            RunError: another run, task or format, or the disk cannot be read.
-        """
+        """Read; RunError for another run, task or format, or a disk that cannot be read."""
         try:
             found = {n: p for n, p in segments(self._folder).items() if n >= self._first}
             expected = self._first

@@ -95,13 +95,7 @@ class _ConsoleHandler(logging.Handler):
 
 @contextmanager
 def logging_to(console: Console, log_format: str = "text", who: str = "master") -> Iterator[None]:
-    """Show the log lines of this room on a console.
-
-    Args:
-        console: where to.
-        log_format: text, or json.
-        who: name of the process in JSON.
-    """
+    """Show the log lines of this room on a console, in JSON with the name of the process."""
     logger, handler = logging.getLogger("master"), _ConsoleHandler(console)
     handler.setFormatter(_TextFormatter() if log_format == "text" else formatter(log_format, who))
     before = logger.level
@@ -132,11 +126,7 @@ def make_progress(
 ) -> Progress:
     """A live panel where the console is a terminal; lines of the log elsewhere, and for JSON.
 
-    Args:
-        console: where to.
-        title: of the panel.
-        log_format: text, or json.
-        evaluator: command that starts one, shown while nobody scores; empty if one will come.
+    The panel shows the command that starts an evaluator while nobody scores.
     """
     if console.is_terminal and log_format == "text":
         return LivePanel(console, title, evaluator)

@@ -56,16 +56,6 @@ class StatusCollector:
         clock: Clock,
         checkpointer: Checkpointer,
     ) -> None:
-        """Collect nothing yet.
-
-        Args:
-            name: of the run.
-            guard: of the trainer.
-            hub: counts messages, and knows who takes part.
-            budget: of the run.
-            clock: of the run, with its record.
-            checkpointer: knows how old the last checkpoint is.
-        """
         self._name, self._guard, self._hub, self._budget = name, guard, hub, budget
         self._clock, self._checkpointer = clock, checkpointer
         self._rates = Rates()
@@ -163,13 +153,7 @@ def _row(peer: Peer, now_s: float, updates: int) -> list[float]:
 
 @dataclass(frozen=True)
 class Sent:
-    """The state of the run when weights were sent.
-
-    Attributes:
-        at_s: monotonic time.
-        episodes: taken in by then.
-        train_s: seconds of training by then.
-    """
+    """Monotonic time, episodes taken in and seconds of training when weights were sent."""
 
     at_s: float
     episodes: int
@@ -177,7 +161,10 @@ class Sent:
 
 
 class Reporter:
-    """Collects what happens between two reports, and passes them on."""
+    """Collects what happens between two reports, and passes them on.
+
+    Listeners get the status about once in a second; `picture` is where test episodes are drawn.
+    """
 
     def __init__(
         self,
@@ -189,17 +176,6 @@ class Reporter:
         listeners: Sequence[Callable[[RunStatus], None]],
         picture: Path,
     ) -> None:
-        """Report nothing yet.
-
-        Args:
-            trainer: which learns.
-            record: takes the scores.
-            status: of the run.
-            progress: for the user.
-            metrics: the curves.
-            listeners: get the status about once in a second.
-            picture: where the newest test episodes are drawn.
-        """
         self._trainer, self._record, self._status = trainer, record, status
         self._progress, self._metrics, self._listeners = progress, metrics, listeners
         self._losses, self._play = Means(), Means()
@@ -287,11 +263,7 @@ class Reporter:
         self._metrics.hyperparameters(result, self._trainer.facts())
 
     def draw(self) -> None:
-        """Write the picture of the last evaluation, where there is one.
-
-        Raises:
-            RunError: the disk does not take it.
-        """
+        """Write the picture of the last evaluation, if any; RunError if the disk is full."""
         if self._latest is not None and len(self._latest.picture):
             drawn = BytesIO()
             Image.fromarray(self._latest.picture).save(drawn, "PNG")

@@ -51,12 +51,7 @@ class DiskError(RunError):
 
 
 class CorruptError(RunError):
-    """A checkpoint that is not as it was written.
-
-    Attributes:
-        path: the checkpoint.
-        why: the file and what is wrong with it.
-    """
+    """A checkpoint that is not as it was written; `why` names the file and what is wrong."""
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"checkpoint {path} is corrupt ({why}): delete it to use the one before")
@@ -68,8 +63,6 @@ class Checkpoint:
     """What one checkpoint folder holds.
 
     Attributes:
-        path: the folder.
-        updates: of the learner when it was written.
         arrays: file stem -> tensor name -> array; only the stems that were asked for.
         counters: everything that is no tensor, as it was passed to `save_checkpoint`.
     """
@@ -127,11 +120,7 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def newest_checkpoint(folder: Path) -> Path:
-    """The newest checkpoint, whether or not its content is whole.
-
-    Raises:
-        RunError: there is none.
-    """
+    """The newest checkpoint, whether or not its content is whole; RunError if there is none."""
     found = list_checkpoints(folder)
     if not found:
         raise RunError(f"no checkpoint in {folder}: train the run first, or name another run_dir")

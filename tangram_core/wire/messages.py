@@ -61,11 +61,7 @@ OPEN = "service.auth=off: open to whoever reaches the port"
 
 
 class BatchError(WireError):
-    """An intact batch whose content is refused: it would be wrong again if it were sent again.
-
-    Attributes:
-        sequence: number of the batch.
-    """
+    """An intact batch, of this number, whose content is refused: it would be wrong again."""
 
     def __init__(self, sequence: int, reason: str) -> None:
         super().__init__(reason)
@@ -152,13 +148,7 @@ class AskStatus(Plain):
 
 @dataclass(frozen=True, eq=False)
 class EpisodeBatch(OfTask):
-    """Whole episodes, as played.
-
-    Attributes:
-        sequence: number of the batch, from 1 within an incarnation.
-        weights_version: of the weights that played it; -1 for none.
-        episodes: the arrays.
-    """
+    """Whole episodes as played, numbered from 1 within an incarnation; version -1: no weights."""
 
     kind: ClassVar[str] = "episodes"
     sequence: Number
@@ -306,11 +296,7 @@ class Reject(Plain):
 
 @dataclass(frozen=True)
 class Alive(Plain):
-    """The answer to a heartbeat.
-
-    Attributes:
-        version: of the newest broadcast, -1 before the first: one that missed it can ask.
-    """
+    """The answer to a heartbeat, by whose version one that missed the newest broadcast can ask."""
 
     kind: ClassVar[str] = "alive"
     version: Version
@@ -326,12 +312,7 @@ class Stop(Plain):
 
 @dataclass(frozen=True, eq=False)
 class WeightsMessage(Plain):
-    """The newest weights.
-
-    Attributes:
-        epoch: of the master that made them.
-        weights: the tensors.
-    """
+    """The newest weights, and the epoch of the master that made them."""
 
     kind: ClassVar[str] = "weights"
     epoch: Id
@@ -431,9 +412,7 @@ def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> 
         shapes: of the tensors that weights must have; None takes any.
 
     Raises:
-        ProtocolError: the master speaks another version.
-        DamagedError: the message was changed on its way.
-        WireError: anything else that is wrong; the reason names the field.
+        WireError: as in `decode_from_worker`.
     """
     return cast("ToWorker", received(frames, _FROM_MASTER, shapes))
 

@@ -277,11 +277,7 @@ def by_kind(union: Any) -> dict[str, type[Message]]:
 def read(
     cls: type[Kind], header: Mapping[str, Any], frames: Sequence[bytes] = (), agreed: Any = None
 ) -> Kind:
-    """The message of an opened header and of the frames after it.
-
-    Raises:
-        WireError: another kind, or content out of bounds; the reason names the field.
-    """
+    """The message of an opened header and the frames after it; WireError names the wrong field."""
     if header["kind"] != cls.kind:
         raise WireError(f"expected {cls.kind}, got a message of kind {header['kind']!r}")
     values = {name: value for name, value in header.items() if name != "kind"}
@@ -321,11 +317,7 @@ def _checked(cls: type[Message], values: dict[str, Any], agreed: Any) -> dict[st
 
 
 def seal(kind: str, fields: Mapping[str, object], frames: Sequence[bytes]) -> list[bytes]:
-    """The header {v, kind, fields..., crc} and the frames.
-
-    Raises:
-        WireError: the header would be larger than a receiver accepts.
-    """
+    """The header {v, kind, fields..., crc} and the frames; WireError if it is too large."""
     largest = 2**32 - 1  # packed at the length of every checksum above 2^16
     header: bytes = msgpack.packb({"v": PROTOCOL, "kind": kind, **fields, "crc": largest})
     if len(header) > MAX_HEADER:

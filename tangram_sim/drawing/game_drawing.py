@@ -60,7 +60,7 @@ def draw_game(
     size: int = 320,
     held: Held | None = None,
 ) -> Image.Image:
-    """One square picture of the pieces over the silhouette of their target.
+    """One square picture of the pieces over the silhouette of their target, `size` pixels wide.
 
     Args:
         layout: which corners belong to which token.
@@ -87,11 +87,7 @@ def figure_sheet(
 ) -> Image.Image:
     """One picture for each of E figures, with its name and how much of it is covered below.
 
-    Args:
-        layout: which corners belong to which token.
-        arena: width of the arena.
-        ends, goals: (E, V, 2) corners of tokens and targets.
-        titles: E names.
+    `ends` and `goals` are corners (E, V, 2) of tokens and targets.
     """
     columns, size = tiles(len(ends), _SHEET)
     pictures = [

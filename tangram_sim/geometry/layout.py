@@ -48,11 +48,7 @@ class TokensConfig(Settings, section="tokens"):
 
 
 def make_layout(config: TokensConfig) -> "Layout":
-    """The layout of a token set.
-
-    Raises:
-        ConfigError: an unknown shape, or a polygon that is not convex.
-    """
+    """The layout of a token set; ConfigError if a shape is unknown, or not convex."""
     return Layout([_shape(entry).scaled(config.scale) for entry in config.shapes])
 
 

@@ -17,13 +17,11 @@ from tangram_sim.config import SimConfig
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """What B environments are to do.
+    """What B environments are to do: which token (B,) moves, or none where they are idle.
 
     Attributes:
-        tokens: (B,) which one moves.
         velocity: (B, 3) in arena units and radians a second.
         flip: (B,) whether it is turned over.
-        idle: (B,) where nothing moves.
     """
 
     tokens: Ints

@@ -45,13 +45,7 @@ def sample_piles(
     """One layout (K, 3) of piles of one to three tokens edge to edge, at least one of several.
 
     The piles lie at least `PILES_APART` of the arena apart: two pixels of a picture of 128. No
-    token lies on its other side.
-
-    Args:
-        layout: the tokens.
-        sim: the arena.
-        rng: draws it.
-        avoid: (M, C, 2) outlines that piles keep clear of where there is room.
+    token lies on its other side. Where there is room they keep clear of outlines (M, C, 2).
 
     Raises:
         SamplingError: a token does not fit into the arena, or no layout was found in `MAX_TRIES`

@@ -141,11 +141,7 @@ def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) ->
 
 
 def check_fits(layout: Layout, sim: SimConfig) -> Floats:
-    """(K,) largest coordinate of each token's centre.
-
-    Raises:
-        SamplingError: a token does not fit into the arena at every angle.
-    """
+    """(K,) largest coordinate of each token's centre; SamplingError if the arena is too small."""
     reach: Floats = sim.arena / 2.0 - layout.radii
     if (reach < 0.0).any():
         worst = layout.shapes[int(np.argmin(reach))]

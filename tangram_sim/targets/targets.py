@@ -59,12 +59,6 @@ def sample_targets(layout: Layout, sim: SimConfig, generators: Generators) -> Si
 def sample_starts(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
     """One start per generator: on the target's sides, or on any with `allow_flip`.
 
-    Args:
-        layout: the tokens.
-        sim: says whether starts keep clear of the target, or are piles.
-        targets: see `sample_targets`.
-        generators: one for each environment.
-
     Raises:
         SamplingError: no room.
     """
@@ -94,14 +88,7 @@ def _piles(layout: Layout, sim: SimConfig, targets: Sides, generators: Generator
 
 
 def check_targets(layout: Layout, sim: SimConfig) -> None:
-    """Refuse what these tokens cannot play.
-
-    Raises:
-        ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
-            or other sides of tokens that look the same on both, what one token does to others,
-            piles of one token, a token too thin for the arena, or a world in which none could
-            move.
-    """
+    """Raise ConfigError, which names the setting, for what these tokens cannot play."""
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
             "sim.allow_flip=true needs a token that is not its own mirror image, got tokens "

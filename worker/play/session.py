@@ -27,22 +27,13 @@ _log = logging.getLogger(__name__)
 
 
 class Acting:
-    """An actor with the version of its weights.
-
-    Attributes:
-        actor: the agent's.
-        version: of the weights that are loaded; -1 before the first.
-    """
+    """An actor with the version of its weights, -1 before the first."""
 
     def __init__(self, actor: Actor) -> None:
         self.actor, self.version = actor, -1
 
     def follow(self, weights: Weights) -> None:
-        """Take over weights that were broadcast.
-
-        Raises:
-            RunError: they belong to another layout or network.
-        """
+        """Take over weights that were broadcast; RunError if they are of another network."""
         self.actor.load(weights.tensors)
         self.version = weights.version
 
@@ -57,11 +48,6 @@ def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]
 
     On leaving, the master is told, after the batches that are on their way, and the signal handlers
     are put back.
-
-    Args:
-        config: of this worker.
-        setup: the task, which the master must share.
-        actor: what the master's weights must fit.
 
     Raises:
         TangramError: the master refuses, or does not answer.
@@ -100,11 +86,7 @@ def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]
 def keep_part(run: Callable[[WorkerConfig, Setup], int], config: WorkerConfig, setup: Setup) -> int:
     """Run a player or an evaluator, and again when another process takes the index it was given.
 
-    Returns:
-        Exit status 0.
-
-    Raises:
-        TangramError: as `run`.
+    Returns its exit status, and raises what it does.
     """
     while True:
         try:

@@ -59,14 +59,7 @@ class Schedule:
 
 
 def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
-    """Score the newest weights until the master or a signal ends it.
-
-    Returns:
-        Exit status 0.
-
-    Raises:
-        TangramError: a setting that cannot work, or a master that refuses or is gone for long.
-    """
+    """Score the newest weights until the master or a signal ends it; as `run_player`."""
     acting, schedule = Acting(setup.agent.actor(setup.task)), _schedule(config.service)
     tests = FixedTests(setup.task, config.service.eval_episodes, config.service.envs)
     with closing(tests), joined(config, setup, acting.actor) as client:

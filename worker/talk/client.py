@@ -71,8 +71,6 @@ class Client:
     Attributes:
         stats: numbers that the next heartbeats tell the master, to be set.
         counters: what was sent again, refused, lost or not understood.
-        outbox: batches that the master has not acknowledged.
-        newest: the newest weights.
         joined: the present connection is known to the master.
         on_progress: called whenever the client is at work.
     """
@@ -115,11 +113,7 @@ class Client:
 
     @property
     def welcome(self) -> Welcome:
-        """The master's last WELCOME: seed, run_id, index, incarnation.
-
-        Raises:
-            TangramError: before `join`.
-        """
+        """The master's last WELCOME: seed, run_id, index, incarnation; only after `join`."""
         if self._welcome is None:
             raise TangramError("the client has not joined a master yet: call join() first")
         return self._welcome
@@ -207,11 +201,7 @@ class Client:
         return self._wait(lambda: self.outbox.free > 0, "the master to take what was played")
 
     def send_scores(self, scores: Scores) -> None:
-        """Send the results of an evaluation, once; they are lost if no master is there.
-
-        Raises:
-            WireError: content that the master would refuse.
-        """
+        """Send the results of an evaluation, once; they are lost if no master is there."""
         if not self._post(scores.encode(self._spec)):
             self.counters["lost_scores"] += 1
 

@@ -70,9 +70,7 @@ def as_address(connect: str) -> str | None:
 def find_master(connect: str) -> MasterAddress | None:
     """The master's address; None while its file, or the folder of its sockets, is not there.
 
-    Args:
-        connect: host:port with or without tcp://, a connection file, or a run folder that holds
-            one.
+    `connect` is host:port with or without tcp://, a connection file, or a run folder with one.
 
     Raises:
         RunError: neither an address nor a readable connection file.
@@ -114,12 +112,7 @@ def find_master(connect: str) -> MasterAddress | None:
 def await_master(
     connect: str, tell: Callable[[str], None], patience_s: float = PATIENCE_S
 ) -> MasterAddress:
-    """The master's address, also when its file is written later.
-
-    Args:
-        connect: see `find_master`.
-        tell: takes a line for the user.
-        patience_s: most to wait.
+    """The master's address, also when its file is written later; `tell` takes a line for the user.
 
     Raises:
         RunError: neither an address nor a readable connection file, or none in time.
