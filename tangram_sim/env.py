@@ -114,11 +114,6 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         rewards = self.batch.reward_fn(achieved.reshape(corners), desired.reshape(corners))
         return float(rewards[0]) if achieved.ndim == 1 else rewards
 
-    def state_matrix(self) -> Floats:
-        """The paper's state (Sec. IV-A): nodes and adjacency stacked, (N, 4 + N)."""
-        batch = self.batch
-        return self.layout.state_matrix(batch.seen[0], batch.placed[0], batch.seen_goals[0])
-
     def render(self) -> Pixels | None:
         """The scene as (size, size, 3), the token that moved last marked; None but in rgb_array."""
         return self._table.picture(0) if self.render_mode == "rgb_array" else None

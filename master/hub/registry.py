@@ -39,12 +39,8 @@ class Peer:
     """A connected process.
 
     Attributes:
-        role, index: its key.
-        incarnation: of its index.
         process: its random id.
-        identity: of its connection.
         last_seen: monotonic seconds.
-        ledger: of its batches.
         stats: numbers of its last heartbeat.
         weights_version: that its last batch was played with.
         batches, episodes, transitions: inserted since it joined.
@@ -240,11 +236,11 @@ class Registry:
             log.warning(text, taken, most, self._room.bound, extra=fields)
 
     def _check_settings(self, hello: Hello) -> None:
-        odd = differing(self._fingerprints, hello.fingerprints)
+        ours, theirs = self._fingerprints, hello.fingerprints
+        odd = sorted(n for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n))
         if not odd:
             return
         listed = ", ".join(odd)
-        ours, theirs = self._fingerprints, hello.fingerprints
         digests = (
             f"{n}: the worker has {theirs.get(n, 'none')}, the master {ours.get(n, 'none')}"
             for n in odd
@@ -302,11 +298,6 @@ class Askers:
             return False
         self._told[identity] = now
         return True
-
-
-def differing(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """Names of the sections whose digests are not equal."""
-    return sorted(n for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n))
 
 
 def _key(name: str) -> Key:

@@ -27,7 +27,7 @@ from zmq.utils import z85
 
 from master.record.audit import Audit
 from master.record.counters import Counters
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import UNREADABLE, ConfigError, RunError
 from tangram_core.run.process import Every
 from tangram_core.run.service import ServiceConfig
 from tangram_core.store.files import own_folder, write_whole
@@ -138,17 +138,7 @@ def read_keys(path: Path) -> Keys:
                 raise ValueError(f"'{name}' is no name, or its role is unknown")
             if len(z85.decode(one.public)) != KEY_BYTES:
                 raise ValueError(f"the key of {name} is none")
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-        struct.error,
-        KeyError,
-        msgspec.MsgspecError,
-        zmq.ZMQError,
-    ) as error:
+    except (*UNREADABLE, struct.error, msgspec.MsgspecError, zmq.ZMQError) as error:
         raise RunError(
             f"{path} does not hold the run's keys ({error}): delete it to make new ones; workers "
             "that run now must then be started again"

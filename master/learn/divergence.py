@@ -85,17 +85,14 @@ class DivergenceGuard:
         self._tally.note(UNDONE, str(error))
         self._in_a_row += 1
         if self._in_a_row >= self._limit:
+            batch = {name: np.array(one) for name, one in self.trainer.learner.evidence().items()}
+            write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
             raise RunError(
                 f"{error}; {self._in_a_row} times in a row, so the run ends. The last batch is in "
-                f"{self._write_batch()}: {self.trainer.learner.advice}, and go on from the last "
+                f"{self._evidence}: {self.trainer.learner.advice}, and go on from the last "
                 "checkpoint with resume=auto"
             )
         self.trainer.go_back(self._good)
-
-    def _write_batch(self) -> Path:
-        batch = {name: np.array(one) for name, one in self.trainer.learner.evidence().items()}
-        write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
-        return self._evidence
 
 
 def _check_finite(arrays: Mapping[str, npt.NDArray[Any]], updates: int) -> None:

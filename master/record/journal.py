@@ -258,9 +258,5 @@ def segment_path(folder: Path, number: int) -> Path:
 def _record(header: Title | Entry, number: int, frames: Sequence[bytes]) -> bytes:
     [packed] = header.encode()
     body = b"".join([LENGTH.pack(len(packed)), packed, join_frames(frames)])
-    return _head(len(body), number, zlib.crc32(body)) + body
-
-
-def _head(length: int, number: int, checksum: int) -> bytes:
-    head = HEAD.pack(MAGIC, length, number, checksum, 0)[: -CRC.size]
-    return head + CRC.pack(zlib.crc32(head))
+    head = HEAD.pack(MAGIC, len(body), number, zlib.crc32(body), 0)[: -CRC.size]
+    return head + CRC.pack(zlib.crc32(head)) + body

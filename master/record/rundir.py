@@ -32,13 +32,8 @@ class RunFolder:
     """Paths of a run folder.
 
     Attributes:
-        path: the folder.
-        config: the resolved config.
         connection: where the master can be reached; there while it runs.
-        keys: of encrypted sockets.
-        checkpoints: folder of the checkpoints.
-        journal: folder of what came since.
-        tensorboard: folder of the curves.
+        journal: folder of what came since the last checkpoint.
         logs: folder of the output of workers and evaluator.
         curve: the scores of every evaluation.
         audit: who joined, left and was refused.

@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -177,7 +176,7 @@ class Reporter:
         picture: Path,
     ) -> None:
         self._trainer, self._record, self._status = trainer, record, status
-        self._progress, self._metrics, self._listeners = progress, metrics, listeners
+        self._progress, self.metrics, self._listeners = progress, metrics, listeners
         self._losses, self._play = Means(), Means()
         self._tick, self._listen = Every(TICK_S, at_once=True), Every(LISTEN_S, at_once=True)
         self._log, self._picture = Every(LOG_S), Every(PICTURE_S, at_once=True)
@@ -214,11 +213,11 @@ class Reporter:
         values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
         updates = scores.weights_version
         sent = self._published.get(updates, self._now())
-        self._metrics.scores(values, updates, sent.episodes, sent.train_s)
+        self.metrics.scores(values, updates, sent.episodes, sent.train_s)
         # Writing it takes time from learning.
         if len(scores.picture) and self._picture.due():
             half = Image.fromarray(scores.picture).reduce(2)
-            self._metrics.picture(np.asarray(half), updates)
+            self.metrics.picture(np.asarray(half), updates)
             with suppress(RunError):  # a disk that fails is told where the run needs it
                 self.draw()
 
@@ -251,16 +250,8 @@ class Reporter:
         for name, value in status.numbers.items():
             if not name.startswith((TEST, PLAYED)):  # those are written when they come
                 values[name if "/" in name else f"run/{name}"] = value
-        self._metrics.scalars(values, self._trainer.updates)
+        self.metrics.scalars(values, self._trainer.updates)
         return status
-
-    def settings(self, resolved: Mapping[str, Any]) -> None:
-        """Write the whole config beside the curves."""
-        self._metrics.settings(resolved)
-
-    def hyperparameters(self, result: Mapping[str, Any]) -> None:
-        """Write what runs are compared by."""
-        self._metrics.hyperparameters(result, self._trainer.facts())
 
     def draw(self) -> None:
         """Write the picture of the last evaluation, if any; RunError if the disk is full."""

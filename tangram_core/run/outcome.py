@@ -5,21 +5,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tangram_core.errors import RunError
+from tangram_core.errors import UNREADABLE, RunError
 from tangram_core.scores import read
 
 FILE_NAME = "result.json"
 BOUNDS = ("max_hours", "max_episodes", "max_updates")
 ROWS = 6  # of scores
-FAULTS = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    RecursionError,
-)
 CTRL_C = {"SIGINT": "Ctrl-C (SIGINT)"}
 
 
@@ -29,7 +20,7 @@ def read_outcome(path: Path) -> dict[str, Any]:
         result = json.loads(path.read_text(encoding="utf-8"))
         outcome_rows(result)
         bound_of(result)
-    except FAULTS as error:
+    except UNREADABLE as error:
         raise RunError(
             f"{path} is no result of a run ({error!r}): name another folder, or "
             "delete the file, without which resume=auto goes on from the last checkpoint"

@@ -14,7 +14,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Self
 
 from pythonjsonlogger.json import JsonFormatter
@@ -139,6 +140,26 @@ class Watchdog:
         if self._seconds:
             self._wound_s = time.monotonic()
             faulthandler.dump_traceback_later(self._seconds, exit=True, file=STDERR)
+
+
+@contextmanager
+def handling(
+    handle: Callable[[signal.Signals], None], numbers: Iterable[signal.Signals]
+) -> Iterator[None]:
+    """These signals call a function, until what was there before is put back.
+
+    Not those that are ignored: nohup and scripts let children ignore some.
+    """
+    before = {
+        number: signal.signal(number, lambda n, _frame: handle(signal.Signals(n)))
+        for number in numbers
+        if signal.getsignal(number) != signal.SIG_IGN
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def keep_memory() -> None:

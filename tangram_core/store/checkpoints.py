@@ -93,7 +93,8 @@ def save_checkpoint(
     aside = folder / f"{_TEMPORARY}{updates:08d}"
     try:
         make_folders(folder, above=False)
-        _drop_temporary(folder)
+        for left in folder.glob(f"{_TEMPORARY}*"):
+            shutil.rmtree(left)
         aside.mkdir()
         _write_content(aside, updates, arrays, counters)
         final = _free_name(folder, updates)
@@ -167,11 +168,6 @@ def _free_name(folder: Path, updates: int) -> Path:
     orders = map(_order, list_checkpoints(folder))
     again = max((number for found, number in orders if found == updates), default=-1) + 1
     return folder / (f"{updates:08d}-{again}" if again else f"{updates:08d}")
-
-
-def _drop_temporary(folder: Path) -> None:
-    for path in folder.glob(f"{_TEMPORARY}*"):
-        shutil.rmtree(path)
 
 
 def _write_content(

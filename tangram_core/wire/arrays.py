@@ -189,20 +189,6 @@ def decode_tensors(frame: bytes, shapes: WeightShapes | None) -> dict[str, Singl
     if len(frame) > MAX_WEIGHTS_BYTES:
         raise WireError(f"weights: {len(frame)} bytes, at most {MAX_WEIGHTS_BYTES}")
     tensors = load_tensors(frame, "weights")
-    _check_tensors(tensors, shapes)
-    return tensors
-
-
-def load_tensors(data: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
-    """The tensors in data of safetensors; WireError, which begins with the name, if it is none."""
-    try:
-        return load(data)
-    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
-    except (SafetensorError, KeyError, ValueError) as error:
-        raise WireError(f"{name}: not safetensors: {error}") from None
-
-
-def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: WeightShapes | None) -> None:
     for name, tensor in tensors.items():
         if tensor.dtype != np.float32:
             raise WireError(f"weights: {name!r} must be float32, got {tensor.dtype}")
@@ -213,6 +199,16 @@ def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: WeightShapes | 
             if wanted != got:
                 raise WireError(f"weights: {name[:80]!r} must be {wanted}, got {got}")
     _check_finite(tensors)
+    return tensors
+
+
+def load_tensors(data: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
+    """The tensors in data of safetensors; WireError, which begins with the name, if it is none."""
+    try:
+        return load(data)
+    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise WireError(f"{name}: not safetensors: {error}") from None
 
 
 def _check_finite(tensors: dict[str, npt.NDArray[Any]]) -> None:

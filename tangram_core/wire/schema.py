@@ -128,8 +128,8 @@ class Numbers(Bound):
     def check(self, where: str, value: Any) -> dict[str, float]:
         """All as floats."""
         for key, number in _entries(where, value):
-            # Comparisons with NaN are false.
-            if not (_is_number(number) and -MAX_NUMBER <= number <= MAX_NUMBER):
+            known = isinstance(number, int | float) and not isinstance(number, bool)
+            if not (known and -MAX_NUMBER <= number <= MAX_NUMBER):  # nor NaN
                 raise _wrong(f"{where}.{key}", "a finite number", number)
         return {key: float(number) for key, number in value.items()}
 
@@ -414,10 +414,6 @@ def _entries(where: str, values: Any) -> Collection[tuple[str, Any]]:
 
 def _is_name(key: Any) -> bool:
     return isinstance(key, str) and NAME.fullmatch(key) is not None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _cut(text: str, size: int) -> str:

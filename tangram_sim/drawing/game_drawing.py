@@ -71,7 +71,12 @@ def draw_game(
         held: the piece that is moved, drawn above the others.
     """
     canvas = empty_table(size * SAMPLES)
-    _draw_silhouette(canvas, to_outlines(layout, arena, goal, canvas.width))
+    # The target as one figure: its fill hides the inner half of every piece's edge.
+    targets = to_outlines(layout, arena, goal, canvas.width)
+    for target in targets:
+        draw_outline(canvas, target, _EDGE, 2.0)
+    for target in targets:
+        fill(canvas, target, SILHOUETTE, 1.0)
     for k, piece in enumerate(to_outlines(layout, arena, corners, canvas.width)):
         if held is None or k != held.token:
             fill(canvas, piece, colour_of(k), _OPACITY)
@@ -106,14 +111,6 @@ def tiles(count: int, width: int) -> tuple[int, int]:
     """How many pictures stand in a row of so many pixels, and the side of each in pixels."""
     columns = min(math.ceil(math.sqrt(1.4 * count)), count)
     return columns, min(max(width // columns, _MIN_TILE), _MAX_TILE)
-
-
-def _draw_silhouette(canvas: Image.Image, targets: Sequence[Sequence[Point]]) -> None:
-    """The target as one figure: its fill hides the inner half of every piece's edge."""
-    for target in targets:
-        draw_outline(canvas, target, _EDGE, 2.0)
-    for target in targets:
-        fill(canvas, target, SILHOUETTE, 1.0)
 
 
 def _draw_held(canvas: Image.Image, arena: float, held: Held, corners: Floats) -> None:

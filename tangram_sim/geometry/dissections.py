@@ -184,7 +184,9 @@ class Search:
         yield from self._fill(valid(outline), self._tokens.counts, [])
 
     def _fill(self, rest: Area, left: tuple[int, ...], laid: list[Laid]) -> Iterator[list[Laid]]:
-        self._remember(laid)
+        area = float(sum(self._tokens.areas[one.shape] for one in laid))
+        if area > self._most:
+            self.best, self._most = laid, area
         parts = parts_of(rest, self._least)
         if not parts:
             if not any(left):
@@ -221,11 +223,6 @@ class Search:
 
     def _without(self, rest: Area, polygon: Polygon) -> Area:
         return without(rest, polygon, self._tolerance, self._tokens.unit)
-
-    def _remember(self, laid: list[Laid]) -> None:
-        area = float(sum(self._tokens.areas[one.shape] for one in laid))
-        if area > self._most:
-            self.best, self._most = laid, area
 
     def _divides(self, areas: Sequence[float], left: tuple[int, ...]) -> bool:
         """Whether tokens that are left have the areas of all parts."""

@@ -134,7 +134,11 @@ def _sketches(entries: list[Any]) -> list[Sketch | list[str]]:
     names: set[str] = set()
     for i, entry in enumerate(entries):
         try:
-            name = _name_of(entry, f"puzzle number {i + 1}")
+            where = f"puzzle number {i + 1}"
+            if not isinstance(entry, dict) or set(entry) != {"name", "pieces"}:
+                keys = "must have exactly the keys name, pieces"
+                raise FaultError(f"{where} {keys}, got {shown(entry)}")
+            name = checked_name(entry["name"], where)
             if name in names:
                 raise FaultError(
                     f"puzzle '{name}': number {i + 1} has a name that is taken: rename it"
@@ -145,12 +149,6 @@ def _sketches(entries: list[Any]) -> list[Sketch | list[str]]:
         except FaultError as fault:
             sketches.append([str(fault)])
     return sketches
-
-
-def _name_of(entry: Any, where: str) -> str:
-    if not isinstance(entry, dict) or set(entry) != {"name", "pieces"}:
-        raise FaultError(f"{where} must have exactly the keys name, pieces, got {shown(entry)}")
-    return checked_name(entry["name"], where)
 
 
 def checked_name(name: Any, where: str) -> str:

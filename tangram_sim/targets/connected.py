@@ -155,7 +155,8 @@ def _attached(
     for _ in range(-(-MAX_TRIES // _CHUNK)):
         turn, shift = _candidates(piece, laid, rng)
         moved = piece.moved(turn[:, None], shift[:, None])
-        free = _apart(moved, laid, _TOUCHING * sim.arena) & (_extent(moved, laid) < sim.arena)
+        extent = np.abs(moved.corners[:, :, None] - laid.corners.ravel()).max(axis=(1, 2))
+        free = _apart(moved, laid, _TOUCHING * sim.arena) & (extent < sim.arena)
         if free.any():
             first = int(np.argmax(free))
             return complex(turn[first]), complex(shift[first])
@@ -197,12 +198,6 @@ def _outside(pieces: _Outlines, others: _Outlines, depth: float) -> Bools:
     gap = others.corners[None, :, None] - pieces.corners[:, None, :, None]
     inwards = (pieces.edges.conj()[:, None, :, None] * gap).imag
     return np.asarray((inwards <= depth).all(axis=-1).any(axis=-1))
-
-
-def _extent(pieces: _Outlines, laid: _Outlines) -> Floats:
-    """(n,) the largest distance between corners of each piece and of the others."""
-    gaps: Floats = np.abs(pieces.corners[:, :, None] - laid.corners.ravel()).max(axis=(1, 2))
-    return gaps
 
 
 def _laid_out(

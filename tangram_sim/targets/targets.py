@@ -4,7 +4,6 @@ Legend: B environments, K tokens. A layout is poses (B, K, 3) and sides (B, K): 
 their other side.
 """
 
-from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations
 
@@ -24,9 +23,8 @@ from tangram_sim.motion.kinematics import wrap
 from tangram_sim.puzzles.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.connected import MAX_PILE, sample_connected, sample_piles
-from tangram_sim.targets.sampling import sample_batch
+from tangram_sim.targets.sampling import Generators, sample_batch
 
-Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
 _NO_TURN = 1e-6  # radians
 MIN_THICKNESS = 1e-3  # of a token, arenas
@@ -101,7 +99,11 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         given, usual = f"sim.motion={sim.motion}", SimConfig.motion
         refuse_ignored(given, "one token", "take a set of several", usual)
     _check_thick(layout, sim)
-    _check_delay(layout, sim)
+    if sim.dynamics.delayed and horizon(layout.tokens, sim) == 1:
+        raise ConfigError(
+            "sim.world=delayed moves nothing in an episode of one action: raise "
+            "sim.actions_per_token to at least 2, or set sim.world=plain"
+        )
     if sim.starts == "piles" and layout.tokens == 1:
         refuse_ignored("sim.starts=piles", "one token", "take a set of several")
     if sim.looks:
@@ -130,14 +132,6 @@ def _check_names(layout: Layout, observe: str) -> None:
                 f"sim.observe={observe} cannot tell {one.name} from {other.name}, which may look "
                 "alike: take equal tokens of one name, or set sim.observe=corners"
             )
-
-
-def _check_delay(layout: Layout, sim: SimConfig) -> None:
-    if sim.dynamics.delayed and horizon(layout.tokens, sim) == 1:
-        raise ConfigError(
-            "sim.world=delayed moves nothing in an episode of one action: raise "
-            "sim.actions_per_token to at least 2, or set sim.world=plain"
-        )
 
 
 def _check_thick(layout: Layout, sim: SimConfig) -> None:

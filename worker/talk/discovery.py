@@ -12,7 +12,7 @@ from typing import Any
 
 from zmq.utils import z85
 
-from tangram_core.errors import RunError
+from tangram_core.errors import UNREADABLE, RunError
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.store.files import check_own
 from tangram_core.wire.addresses import IPC, dns_error
@@ -95,14 +95,7 @@ def find_master(connect: str) -> MasterAddress | None:
         return MasterAddress(*known, content.get("settings"))
     except FileNotFoundError:
         return None
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ) as error:
+    except UNREADABLE as error:
         raise RunError(
             f"{path} is no connection file ({_why(error)}): connect=... takes host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
