@@ -36,7 +36,7 @@ from tangram_core.run.process import Every
 from tangram_core.store.files import is_same, make_folders, sync_folder
 from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
-from tangram_core.wire.schema import MAX_COUNT, Plain
+from tangram_core.wire.schema import MAX_COUNT, Message
 
 FORMAT = 4
 SUFFIX = ".log"
@@ -61,7 +61,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Title(Plain):
+class Title(Message):
     """What a segment is of; the task is a digest of what the arrays belong to."""
 
     kind: ClassVar[str] = "segment"
@@ -71,7 +71,7 @@ class Title(Plain):
 
 
 @dataclass(frozen=True)
-class Entry(Plain):
+class Entry(Message):
     """Who sent the batch that follows."""
 
     kind: ClassVar[str] = "batch"

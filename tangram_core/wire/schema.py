@@ -214,19 +214,11 @@ class Message:
         check_frames(cls.kind, frames, 0)
         return cls(**values)
 
-    def frames(self, agreed: Any) -> list[bytes]:
-        """The whole message, checked as the receiver will check it."""
+    def encode(self, agreed: Any = None) -> list[bytes]:
+        """The message's frames, of arrays as agreed on; WireError for what would be refused."""
         more, arrays = self.pack(agreed)
         values = {name: getattr(self, name) for name in self.bounds}
         return seal(self.kind, _checked(type(self), {**values, **more}, agreed), arrays)
-
-
-class Plain(Message):
-    """A message that can be read without knowing the task."""
-
-    def encode(self) -> list[bytes]:
-        """The message's frames; WireError for content that a receiver would refuse."""
-        return self.frames(None)
 
 
 class Table(Message):

@@ -120,14 +120,14 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
 def _check_names(layout: Layout, observe: str) -> None:
     """What is found in pictures has no name: tokens of one name must be equal, others unlike."""
     for one, other in combinations(layout.shapes, 2):
-        turn = turn_onto(one.corners, other.corners)
+        turn = _turn_of(one, other)
         if one.name == other.name:
-            if turn is None or abs(turn) > _NO_TURN:
+            if turn is None or turn[1] or abs(turn[0]) > _NO_TURN:
                 raise ConfigError(
                     f"sim.observe={observe} takes tokens of one name for equal, and two of "
                     f"{one.name} have other corners: give them names of their own"
                 )
-        elif turn is not None or turn_onto(mirror_image(one.corners), other.corners) is not None:
+        elif turn is not None:
             raise ConfigError(
                 f"sim.observe={observe} cannot tell {one.name} from {other.name}, which may look "
                 "alike: take equal tokens of one name, or set sim.observe=corners"
@@ -157,8 +157,9 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
     left = list(range(len(puzzle.pieces)))
     poses, flipped = np.empty((layout.tokens, 3)), np.zeros(layout.tokens, dtype=np.bool_)
     for token, shape in enumerate(layout.shapes):
-        piece = next((k for k in left if _is_piece(puzzle, k, shape)), None)
-        if piece is None:
+        turns = ((k, _turn_of(shape, puzzle.layout.shapes[k])) for k in left)
+        piece, turn = next((one for one in turns if one[1] is not None), (-1, None))
+        if turn is None:
             raise ConfigError(
                 f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)} of scale "
                 f"{puzzle.scale:g}: it cannot be assembled from the tokens "
@@ -166,13 +167,9 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
                 f"tokens.scale={puzzle.scale:g}"
             )
         left.remove(piece)
-        own = puzzle.layout.shapes[piece]
-        turn = turn_onto(shape.corners, own.corners)
-        flipped[token] = turn is None
-        if turn is None:
-            turn = turn_onto(mirror_image(shape.corners), own.corners)
         poses[token] = puzzle.poses[piece]
-        poses[token, 2] += turn or 0.0
+        poses[token, 2] += turn[0]
+        flipped[token] = turn[1]
     if left:
         raise ConfigError(
             f"puzzle '{puzzle.name}' has {len(puzzle.pieces)} pieces, and there are "
@@ -181,12 +178,13 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
     return poses, flipped
 
 
-def _is_piece(puzzle: Puzzle, piece: int, shape: Shape) -> bool:
-    own = puzzle.layout.shapes[piece].corners
-    return any(
-        turn_onto(corners, own) is not None
-        for corners in (shape.corners, mirror_image(shape.corners))
-    )
+def _turn_of(shape: Shape, other: Shape) -> tuple[float, bool] | None:
+    """The angle by which a shape is another one, and whether on its other side, or None."""
+    for flipped, corners in ((False, shape.corners), (True, mirror_image(shape.corners))):
+        turn = turn_onto(corners, other.corners)
+        if turn is not None:
+            return turn, flipped
+    return None
 
 
 def _kind(sim: SimConfig, rng: np.random.Generator) -> str:

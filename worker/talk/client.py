@@ -42,7 +42,7 @@ from tangram_core.wire.messages import (
     Welcome,
     decode_from_master,
 )
-from tangram_core.wire.schema import Plain, ProtocolError
+from tangram_core.wire.schema import Message, ProtocolError
 from worker.talk.connection import Connection, Sockets, Timing
 from worker.talk.outbox import NewestWeights, Outbox
 
@@ -287,7 +287,7 @@ class Client:
         self._hello_at = now + self._timing.retry_s
         self._ask(sockets, hello, now)
 
-    def _ask(self, sockets: Sockets, question: Plain, now: float) -> None:
+    def _ask(self, sockets: Sockets, question: Message, now: float) -> None:
         self._connection.asked(now)
         sockets.send(question.encode())
 
