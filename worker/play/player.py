@@ -30,6 +30,8 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
         closing(setup.task.make(config.service.envs, "play")) as env,
         joined(config, setup, acting.actor) as client,
     ):
+        if client.stopped:
+            return 0
         with report.waiting("no weights yet"):
             first = client.wait_for_weights()
         if first is None:
