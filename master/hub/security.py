@@ -117,7 +117,7 @@ def holders(keys: Keys) -> dict[str, Holder]:
 
 
 def run_keys(path: Path) -> Keys:
-    """The keys of a run; made, and kept where only the user may read them, the first time."""
+    """The keys of a run, see `read_keys`; made, for the user alone to read, the first time."""
     if not path.exists():
         write_keys(path, make_keys())
     return read_keys(path)
@@ -152,7 +152,7 @@ def write_keys(path: Path, keys: Keys) -> None:
 
 
 def needs_keys(service: ServiceConfig) -> bool:
-    """Whether who takes part must show a key: always, but on the sockets of one user."""
+    """Whether who takes part must show a key, as on any address; ConfigError if ZeroMQ cannot."""
     wanted = service.bind != LOCAL and service.auth == "on"
     if wanted and not zmq.has("curve"):
         raise ConfigError(

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 class Health:
-    """A small HTTP server in threads of its own, on a port of its own, 0 for any free one.
+    """A small HTTP server in threads of its own; port 0 is any free one.
 
     Attributes:
         url: where it listens.

@@ -15,7 +15,7 @@ CTRL_C = {"SIGINT": "Ctrl-C (SIGINT)"}
 
 
 def read_outcome(path: Path) -> dict[str, Any]:
-    """A result.json that has all which `outcome_rows` and `bound_of` need; else RunError."""
+    """A result.json that has all that `outcome_rows` and `bound_of` need; else RunError."""
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
         outcome_rows(result)

@@ -41,7 +41,7 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True)
 
 
 def make_folders(folder: Path, above: bool = True) -> None:
-    """Make a folder and those above, where missing, with its name on the disk; or OSError."""
+    """Make a folder, and with `above` those above it, with its name on the disk; or OSError."""
     try:
         folder.mkdir(exist_ok=True)
     except FileNotFoundError:

@@ -181,7 +181,7 @@ def contact_sheet(
 def save_gif(
     images: Sequence[Image.Image], target: Path | BinaryIO, milliseconds: int = 400
 ) -> None:
-    """An endless animation, every picture, of at least one, shown for `milliseconds`."""
+    """An endless animation of at least one picture, each shown for `milliseconds`."""
     if not images:
         raise ValueError("an animation needs at least one picture")
     # One palette for all frames, from frames all over the film: colours must not flicker.
