@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 
 class Checkpointer:
-    """Journals batches, and writes checkpoints when they are due.
+    """Journals batches, and writes checkpoints when they are due, of nothing that is not finite.
 
     Attributes:
         failing: the disk takes nothing more.
@@ -66,16 +66,6 @@ class Checkpointer:
         journal: Journal,
         clock: Clock,
     ) -> None:
-        """Write nothing yet.
-
-        Args:
-            service: how often.
-            claim: of the run's folder.
-            guard: of the trainer; only what is finite is saved.
-            hub: its table of duplicates is saved with the rest.
-            journal: open.
-            clock: of the run's record.
-        """
         self._claim, self._guard, self._hub, self._journal = claim, guard, hub, journal
         self._folder, self._clock = claim.run.checkpoints, clock
         self._newest = next(reversed(list_checkpoints(self._folder)), None)
@@ -132,11 +122,7 @@ class Checkpointer:
         return self._newest
 
     def _keep_safe(self) -> None:
-        """Write a checkpoint at once where what was acknowledged is not on the disk any more.
-
-        Raises:
-            FolderError, JournalError, DiskError: as in `save`.
-        """
+        """Write a checkpoint at once where what was acknowledged is not on the disk any more."""
         journal, known = self._journal, self._journal.exposed
         gone = "was made anew" if self._claim.check() else ""
         self.homeless = False
@@ -189,13 +175,7 @@ class Restored:
 
 
 def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
-    """Write a checkpoint from which `restore_run` goes on.
-
-    Args:
-        folder: of all checkpoints.
-        trainer: networks, replay, counters and generators.
-        rest: everything else.
-        keep: newest checkpoints that stay.
+    """Write a checkpoint from which `restore_run` goes on; the newest `keep` stay.
 
     Raises:
         DiskError: the folder cannot be written; what was there before is as it was.

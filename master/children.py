@@ -32,7 +32,6 @@ class Child:
     """One process, or several one after another in the same place.
 
     Attributes:
-        name: for messages.
         arguments: of this Python.
         log: file that its output is appended to, None for the terminal.
         nice: added to its niceness.

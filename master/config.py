@@ -31,11 +31,7 @@ class KeysConfig(Settings):
 
 
 def check_compiling(service: ServiceConfig) -> None:
-    """Refuse to compile without a compiler.
-
-    Raises:
-        ConfigError: says what is missing.
-    """
+    """Raise ConfigError, which says what is missing, where updates cannot be compiled."""
     if not service.compile:
         return
     named = os.environ.get("CXX")

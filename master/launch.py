@@ -14,11 +14,11 @@ from master.config import MasterConfig
 from master.hub.security import listening_place
 from master.record.resumable import check_resumable
 from master.record.rundir import RunFolder
-from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
+from master.signals import SAME_WISH_S, SIGNALS, show_cursor, stop_notice
 from master.watch.console import logging_to, sturdy_console
 from master.watch.result import show_finished
 from tangram_core.run.code import code_of
-from tangram_core.run.process import WATCHDOG_S, Every, watch_parent
+from tangram_core.run.process import WATCHDOG_S, Every, handling, watch_parent
 from tangram_core.wire.messages import TAKEN_OVER
 
 # While the master starts, its connection file is looked for this often.
@@ -93,7 +93,7 @@ class Launcher:
 
     def signals(self) -> AbstractContextManager[None]:
         """Turn signals into events."""
-        return handling(self._events.put)
+        return handling(self._events.put, SIGNALS)
 
     def run(self) -> int:
         """Run until the master has ended; returns the exit status for the user."""

@@ -35,18 +35,8 @@ log = logging.getLogger(__name__)
 class Loop:
     """Takes in, learns, publishes and saves until a bound or a signal ends it.
 
-    Attributes:
-        service: rates and intervals.
-        folder: of the run; its connection file goes away with the loop.
-        hub: the sockets, open.
-        guard: of the trainer, which it updates.
-        lockstep: the rounds, where there are such.
-        budget: bounds of the run.
-        clock: adds up its time.
-        checkpointer: keeps what must not be lost.
-        reporter: tells what goes on.
-        signals: that end the loop.
-        watchdog: ends the process where the loop hangs.
+    Its collaborators are open when it is made, and its folder's connection file goes away with it.
+    The watchdog ends the process where the loop hangs.
     """
 
     service: ServiceConfig
@@ -145,11 +135,7 @@ class Loop:
             self.publish()
 
     def publish(self) -> None:
-        """Send the acting weights, unless these were sent before.
-
-        Raises:
-            RunError: they are not finite, one time too many; nothing was sent.
-        """
+        """Send the acting weights, unless these were sent before; RunError as in `weights`."""
         if self._trainer.updates <= self._published:
             return
         weights = self.guard.weights()

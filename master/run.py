@@ -1,11 +1,13 @@
 """One run of the master: its collaborators are made or restored, then the loop begins."""
 
 import logging
+import secrets
 import socket
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +72,8 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
     console = sturdy_console(sys.stdout)
     with ExitStack() as opened:
         opened.enter_context(logging_to(console, form))
-        launched = watch_parent(_tell_news, GRACE_S)
+        # The launcher shares the terminal with this process: its lines are shown here.
+        launched = watch_parent(partial(log.info, "%s", extra={"event": "launcher"}), GRACE_S)
         Room.here()  # before anything is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
@@ -91,32 +94,22 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         progress = make_progress(console, f"tangram · {folder.path.name}", form, evaluator)
         opened.enter_context(closing(progress))
         loop, connection = open_run(config, setup, claim, progress, signals, watchdog, opened)
-        loop.reporter.settings(resolved)
+        loop.reporter.metrics.settings(resolved)
         folder.write_connection(connection)
         if not launched:
             log.info("workers join with: %s", command_line("tangram-worker", join))
             log.info("an evaluator scores what is learned: %s", evaluator)
         reason = loop.run()
-        result = make_result(
-            loop.finish(launched),
-            setup.task.scores,
-            loop.guard.trainer.facts(),
-            config.seed,
-            reason,
-        )
+        facts, scores = loop.guard.trainer.facts(), setup.task.scores
+        result = make_result(loop.finish(launched), scores, facts, config.seed, reason)
         folder.write_result(result)
-        loop.reporter.hyperparameters(result)
+        loop.reporter.metrics.hyperparameters(result, facts)
         loop.dismiss(f"the run has ended ({reason})")
         if form == "json":
             log.info("the run has ended (%s)", reason, extra={"event": "result", **result})
     if form != "json":
         show_result(console, folder, result, code, go_on)
     return 0
-
-
-def _tell_news(line: str) -> None:
-    """Show the lines of the launcher, which shares the terminal with this process."""
-    log.info("%s", line, extra={"event": "launcher"})
 
 
 def open_run(
@@ -130,14 +123,8 @@ def open_run(
 ) -> tuple[Loop, dict[str, Any]]:
     """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
 
-    Args:
-        config: the master's settings.
-        setup: the task and the agent.
-        claim: of the run's folder, which is prepared.
-        progress: for the user.
-        signals: that end the run.
-        watchdog: hears of every batch of the journal, which may take long to read.
-        opened: closes what is opened here.
+    The watchdog hears of every batch of the journal, which may take long to read. What is opened
+    here is closed with `opened`.
 
     Returns:
         The loop, and what a worker needs to find this master and to be let in.
@@ -146,9 +133,9 @@ def open_run(
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
     service, folder = config.service, claim.run
-    _prepare_process(service.threads)
     trainer, found = _make_trainer(config, setup, folder, watchdog)
-    rest = found or Restored(_new_record(folder.journal), {})
+    # A run that was killed before its first checkpoint has a journal.
+    rest = found or Restored(Record(journal_run_id(folder.journal) or secrets.token_hex(8)), {})
     run_id = rest.record.run_id
     guard = DivergenceGuard(trainer, folder.bad_batch)
     clock, budget = Clock(rest.record), Budget(config, trainer, rest.record)
@@ -203,15 +190,7 @@ def open_run(
 def connection_of(
     service: ServiceConfig, hub: Hub, run_id: str, http: str | None, keys: Keys | None
 ) -> dict[str, Any]:
-    """What a worker needs to find this master, and to be let in.
-
-    Args:
-        service: names the host that workers find it under.
-        hub: with its sockets open.
-        run_id: of the run.
-        http: where /metrics and /healthz are, if they are anywhere.
-        keys: where the sockets are encrypted.
-    """
+    """What a worker needs to find this master, and to be let in where there are keys."""
     host = service.host or socket.gethostname()
     announced = with_host if service.host else reachable
     if service.host and (unknown := dns_error(with_host(hub.endpoint, host))):
@@ -255,17 +234,13 @@ def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
     return None
 
 
-def _prepare_process(threads: int) -> None:
-    """What holds for all learning of this process."""
-    torch.set_num_threads(threads)
-    keep_memory()
-
-
 def _make_trainer(
     config: MasterConfig, setup: Setup, folder: RunFolder, watchdog: Watchdog
 ) -> tuple[Trainer, Restored | None]:
     """What learns, with the newest checkpoint, or the networks of another run, where asked for."""
     service = config.service
+    torch.set_num_threads(service.threads)
+    keep_memory()
     device = choose_device(service.device)
     trainer = Trainer(setup, config.seed, device, compiled=service.compile)
     found = restore_run(folder.checkpoints, trainer) if config.resume == "auto" else None
@@ -283,12 +258,6 @@ def _make_trainer(
             "service.compile=true is faster (needs g++ or clang++)"
         )
     return trainer, found
-
-
-def _new_record(journal: Path) -> Record:
-    """A new record, of the run whose journal lies here if it was killed before a checkpoint."""
-    run_id = journal_run_id(journal)
-    return Record() if run_id is None else Record(run_id)
 
 
 def _insert_again(

@@ -4,11 +4,10 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from typing import Any, Self
 
 from tangram_core.run.outcome import CTRL_C
+from tangram_core.run.process import handling
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 # submitit's, near a time limit: all processes of a job get it, and tangram-train leaves it to
@@ -17,27 +16,6 @@ SUBMITIT = signal.SIGUSR2
 # One wish to end may arrive twice: a time limit signals a process and then its whole group.
 SAME_WISH_S = 1.0
 SHOW_CURSOR = b"\x1b[?25h\n"
-
-
-def heeded(numbers: Iterable[signal.Signals] = SIGNALS) -> list[signal.Signals]:
-    """The signals that are not ignored: nohup and scripts let children ignore some."""
-    return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
-
-
-@contextmanager
-def handling(
-    handle: Callable[[signal.Signals], None], numbers: Iterable[signal.Signals] = SIGNALS
-) -> Iterator[None]:
-    """These signals call a function, until what was there before is put back."""
-    before = {
-        number: signal.signal(number, lambda n, _frame: handle(signal.Signals(n)))
-        for number in heeded(numbers)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def stop_notice(name: str) -> str:

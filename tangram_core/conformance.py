@@ -35,11 +35,7 @@ _AS_GOOD: dict[str, tuple[Any, ...]] = {"f4": (np.float64,), "u1": (np.bool_,)}
 
 
 def check_task(task: Task, count: int = 3) -> None:
-    """Play a task with random actions, and hold it to `Task` and `Env`.
-
-    Args:
-        task: that can be played on this machine.
-        count: environments side by side.
+    """Play a task with random actions, side by side, and hold it to `Task` and `Env`.
 
     Raises:
         ConformanceError: names the class, the method, what was wanted and what came.
@@ -55,7 +51,8 @@ def check_task(task: Task, count: int = 3) -> None:
         _check_same(env, "reset", "the same of the same generators", played, again)
         _check_rewards(task, played.episodes)
         _check_score(task, played)
-        _check_rivals(task, env, count)
+        for name, made in task.rivals().items():
+            play(task, env, _generators(count), _watched(task, f"rivals[{name!r}]", made(env)))
     finally:
         env.close()
         env.close()
@@ -77,12 +74,7 @@ def check_task(task: Task, count: int = 3) -> None:
 
 
 def check_agent(agent: Agent, task: Task, device: str = "cpu") -> None:
-    """Let an agent play and learn a task, and hold it to `Agent`, `Actor` and `Learner`.
-
-    Args:
-        agent: of small networks and batches.
-        task: that it can play.
-        device: of torch.
+    """Let an agent of small networks play and learn a task; hold it to `Agent`, `Actor`, `Learner`.
 
     Raises:
         ConformanceError: names the class, the method, what was wanted and what came.
@@ -106,7 +98,11 @@ def check_agent(agent: Agent, task: Task, device: str = "cpu") -> None:
         if not 0 < found <= episodes.transitions:
             _fail(learner, "insert", f"1 to {episodes.transitions} transitions", found)
     for number in range(3):
-        _check_update(learner, learner.update(0.0, rng), number + 1)
+        numbers = learner.update(0.0, rng)
+        if not numbers or not np.isfinite(list(numbers.values())).all():
+            _fail(learner, "update", "finite numbers", numbers)
+        if learner.updates != number + 1:
+            _fail(learner, "update", f"updates to be {number + 1}", learner.updates)
     _check_round_trip(agent, task, learner, device)
     _check_refusals(agent, task, learner, device)
 
@@ -218,11 +214,6 @@ def _check_score(task: Task, played: Played) -> None:
         _fail(task, "draw", "uint8 (H, W, 3) or None", f"{picture.dtype} {picture.shape}")
 
 
-def _check_rivals(task: Task, env: Env, count: int) -> None:
-    for name, made in task.rivals().items():
-        play(task, env, _generators(count), _watched(task, f"rivals[{name!r}]", made(env)))
-
-
 def _watched(task: Task, method: str, act: Act) -> Act:
     def watched(seen: Arrays, past: History, generators: Generators) -> Singles:
         found = act(seen, past, generators)
@@ -262,13 +253,6 @@ def _check_acting(agent: Agent, task: Task, learner: Learner) -> None:
             _fail(actor, "act", "the same of the same generators", "other actions")
         if not np.allclose(whole[1:2], act(slice(1, 2)), atol=CLOSE):
             _fail(actor, "act", "an action that hangs on no other row", "another one alone")
-
-
-def _check_update(learner: Learner, numbers: Mapping[str, float], made: int) -> None:
-    if not numbers or not np.isfinite(list(numbers.values())).all():
-        _fail(learner, "update", "finite numbers", dict(numbers))
-    if learner.updates != made:
-        _fail(learner, "update", f"updates to be {made}", learner.updates)
 
 
 def _check_round_trip(agent: Agent, task: Task, learner: Learner, device: str) -> None:
@@ -326,15 +310,12 @@ def _random(task: Task) -> Act:
 
     def act(seen: Arrays, past: History, generators: Generators) -> Singles:  # noqa: ARG001
         if not past.actions.shape[1]:
-            rng.update({i: np.random.default_rng(_first(one)) for i, one in enumerate(generators)})
+            seeds = [int(one.spawn(1)[0].integers(2**31)) for one in generators]
+            rng.update({i: np.random.default_rng(seed) for i, seed in enumerate(seeds)})
         rows = [rng[i].uniform(-1.0, 1.0, task.spec.action_size) for i in range(len(generators))]
         return np.array(rows, np.float32)
 
     return act
-
-
-def _first(generator: np.random.Generator) -> int:
-    return int(generator.spawn(1)[0].integers(2**31))
 
 
 def _generators(count: int) -> list[np.random.Generator]:

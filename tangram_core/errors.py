@@ -4,6 +4,17 @@ Command lines print them as one line and exit with status 2, so each message nam
 the bound and what to do.
 """
 
+# What reading a file raises that anybody may have written: it is missing, no JSON, or another one.
+UNREADABLE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
+
 
 class TangramError(Exception):
     """Base of every error that is shown to the user without a traceback."""

@@ -80,11 +80,7 @@ class Settings:
         cls.section = section
 
     def __post_init__(self) -> None:
-        """Check each setting against its declaration.
-
-        Raises:
-            ConfigError: names the setting, its value and its bound or choices.
-        """
+        """Check each setting; ConfigError names it, its value and its bound or choices."""
         for own in declared_fields(type(self)):
             _check(setting_name(self, own.name), getattr(self, own.name), own.metadata[KEY])
         for own in declared_fields(type(self)):

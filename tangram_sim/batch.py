@@ -125,8 +125,7 @@ class BatchedEnv:
             reward: what an action is worth.
             count: B.
             eye: finds tokens in pictures, where these are what is observed.
-            outlines: whether who plays takes rows of outlines for goals, for
-                `sim.observe=silhouette`.
+            outlines: whether who plays takes outlines for goals, for `sim.observe=silhouette`.
 
         Raises:
             ConfigError: pictures are to be observed, and there is no eye; or silhouettes are.

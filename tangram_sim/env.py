@@ -75,11 +75,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; a seed fixes this one and all that follow.
-
-        Raises:
-            SamplingError: no layout without overlap was found.
-        """
+        """Begin an episode; a seed fixes this one and all that follow; SamplingError: no room."""
         super().reset(seed=seed, options=options)
         self._table.reset([self.np_random])
         self._show()
@@ -117,11 +113,6 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         desired = np.asarray(desired_goal, dtype=np.float64)
         rewards = self.batch.reward_fn(achieved.reshape(corners), desired.reshape(corners))
         return float(rewards[0]) if achieved.ndim == 1 else rewards
-
-    def state_matrix(self) -> Floats:
-        """The paper's state (Sec. IV-A): nodes and adjacency stacked, (N, 4 + N)."""
-        batch = self.batch
-        return self.layout.state_matrix(batch.seen[0], batch.placed[0], batch.seen_goals[0])
 
     def render(self) -> Pixels | None:
         """The scene as (size, size, 3), the token that moved last marked; None but in rgb_array."""

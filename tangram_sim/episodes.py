@@ -16,13 +16,7 @@ def spec_of(
     is 1 where a token is placed. Where pictures are what is observed, seen (K,) is 1 where a token
     was found in the picture, or should have left that of several tokens, and goals_seen (K,) the
     same of the target's pieces; closed (K,) is 1 where no action should name a token: it is placed,
-    or not seen while others are.
-
-    Args:
-        layout: the tokens.
-        sim: the world.
-        reward: what an action is worth.
-        outlines: whether goals are rows (G, 2) of outlines.
+    or not seen while others are. With `outlines` goals are rows (G, 2) of outlines.
     """
     tokens, bound = layout.tokens, corner_bound(layout.tokens, sim)
     looks = (

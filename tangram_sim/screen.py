@@ -14,11 +14,7 @@ class Screen:
     """A window, opened by its first picture."""
 
     def __init__(self, title: str, fps: int) -> None:
-        """Look whether a window can be shown.
-
-        Raises:
-            ConfigError: pygame is not installed, or there is no display.
-        """
+        """Look whether a window can be shown; ConfigError without pygame, or without a display."""
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it greets on stdout
         try:
             import pygame  # noqa: PLC0415 - optional

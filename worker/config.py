@@ -9,22 +9,28 @@ from tangram_core.wire.messages import MAX_INDEX, ROLES
 from worker.talk.discovery import as_address, find_master
 
 
-def _check_connect(value: str) -> None:
-    if not value.strip():
-        raise ConfigError("connect must name the master's endpoint, got '': set connect=HOST:PORT")
-    if as_address(value) is not None:
-        find_master(value)  # no file is read: it only has to be one
-
-
 @dataclass(frozen=True)
-class WorkerConfig(Settings):
-    """One process that plays for a master, or that scores what the master has learned."""
-
+class _Connected(Settings):
     connect: str = field(
         metadata=declared(
             "the run: its folder or its connection.json; host:port with service.auth=off only"
         )
     )
+
+    def __post_init__(self) -> None:
+        if not self.connect.strip():
+            raise ConfigError(
+                "connect must name the master's endpoint, got '': set connect=HOST:PORT"
+            )
+        if as_address(self.connect) is not None:
+            find_master(self.connect)  # no file is read: it only has to be one
+        super().__post_init__()
+
+
+@dataclass(frozen=True)
+class WorkerConfig(_Connected):
+    """One process that plays for a master, or that scores what the master has learned."""
+
     role: str = setting(
         "player", "player, or evaluator: plays fixed tests, noise off, sends scores", choices=ROLES
     )
@@ -33,22 +39,9 @@ class WorkerConfig(Settings):
     )
     service: ServiceConfig = field(default_factory=ServiceConfig)
 
-    def __post_init__(self) -> None:
-        _check_connect(self.connect)
-        super().__post_init__()
-
 
 @dataclass(frozen=True)
-class StatusConfig(Settings):
+class StatusConfig(_Connected):
     """How a run stands (tangram-status)."""
 
-    connect: str = field(
-        metadata=declared(
-            "the run: its folder or its connection.json; host:port with service.auth=off only"
-        )
-    )
     json: bool = setting(False, "print one JSON object a line instead of a table")
-
-    def __post_init__(self) -> None:
-        _check_connect(self.connect)
-        super().__post_init__()

@@ -41,10 +41,7 @@ REFUSED = {
 
 
 def show_status(config: StatusConfig) -> int:
-    """Print the status, or the result of a run that has finished.
-
-    Returns:
-        Exit status 0.
+    """Print the status, or the result of a run that has finished; exit status 0.
 
     Raises:
         TangramError: neither a connection file nor a result, keys that do not fit, or a master
@@ -74,16 +71,7 @@ def _print_result(console: Console, result: Mapping[str, Any], config: StatusCon
 def ask_status(
     connect: str, context: "zmq.Context[zmq.Socket[bytes]]", patience_s: float = PATIENCE_S
 ) -> RunStatus:
-    """The present status of a run.
-
-    Args:
-        connect: host:port, a connection file, or a run folder that holds one.
-        context: of the sockets.
-        patience_s: to wait for the answer.
-
-    Raises:
-        TangramError: see `show_status`.
-    """
+    """The present status of a run, see `find_master` and `show_status`."""
     address = find_master(connect)
     if address is None:
         raise TangramError(f"no connection file at {connect}: {_nobody(Path(connect) / CONFIG)}")
@@ -112,17 +100,6 @@ def ask_status(
     )
 
 
-def status_rows(status: RunStatus) -> list[tuple[str, str]]:
-    """What people want to know of a run that goes on, as names and texts."""
-    numbers = defaultdict(lambda: UNKNOWN, status.numbers)
-    return [*_lines(numbers, status.texts), *_scores(status)]
-
-
-def worker_rows(status: RunStatus) -> list[tuple[str, ...]]:
-    """Each process that takes part, as texts under TABLE_COLUMNS."""
-    return [_worker_row(row) for row in status.workers.tolist()]
-
-
 def _nobody(config: Path) -> str:
     """Why no master can be asked; each writes its config when it starts."""
     if not config.is_file():
@@ -148,7 +125,8 @@ def _plain(status: RunStatus) -> dict[str, Any]:
 def _print(console: Console, status: RunStatus, connect: str) -> None:
     texts = status.texts
     console.print(f"run {texts.get('run', '?')} ({texts.get('run_id', '?')})", highlight=False)
-    _print_rows(console, status_rows(status))
+    numbers = defaultdict(lambda: UNKNOWN, status.numbers)
+    _print_rows(console, [*_lines(numbers, texts), *_scores(status)])
     if len(status.workers):
         console.print(_table(status))
     if status.numbers.get("evaluators") == 0:  # whole, so that it can be copied
@@ -219,8 +197,8 @@ def _table(status: RunStatus) -> Table:
     table = Table(box=None, padding=(0, 2))
     for name in TABLE_COLUMNS:
         table.add_column(name, justify="left" if name == "process" else "right")
-    for row in worker_rows(status):
-        table.add_row(*row)
+    for row in status.workers.tolist():
+        table.add_row(*_worker_row(row))
     return table
 
 

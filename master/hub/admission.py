@@ -19,16 +19,11 @@ from tangram_core.wire.messages import ROLES, TAKEN_OVER, Hello, Refused, Stop, 
 
 @dataclass(frozen=True)
 class WelcomeInfo:
-    """What the master tells, and asks of, a process that joins.
+    """What the master tells, and asks of, a process that joins; see `Welcome` and `Hello`.
 
     Attributes:
-        run_id: of the run.
-        seed: of the run.
-        fingerprints: section of the settings -> digest; a worker's must be equal.
         spec: the task that arrays are checked against.
         scores: names that an evaluator may report.
-        window: most unacknowledged batches of one peer.
-        lockstep: players wait for orders.
     """
 
     run_id: str
@@ -56,16 +51,6 @@ class Admission:
         counters: Counters,
         audit: Audit,
     ) -> None:
-        """Nobody takes part yet.
-
-        Args:
-            info: what joiners are told, and must agree with.
-            silence_s: after which a peer is forgotten.
-            room: for peers.
-            sockets: for the answers.
-            counters: of those who joined and were refused.
-            audit: of who joins, leaves and is refused.
-        """
         self.registry = Registry(info.fingerprints, silence_s, room)
         self._info, self._silence_s = info, silence_s
         self._sockets, self._counters, self._audit = sockets, counters, audit

@@ -55,11 +55,7 @@ class Room:
 
     @staticmethod
     def here() -> "Room":
-        """As much as this process has or may take.
-
-        Raises:
-            ConfigError: there is none for a single worker.
-        """
+        """As much as this process has or may take; ConfigError if there is none for a worker."""
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
         soft, hard = (MOST_FILES if n == resource.RLIM_INFINITY else n for n in limits)
         room = Room(max(soft, min(hard, MOST_FILES)))
@@ -94,7 +90,10 @@ AMPLE = Room(MOST_FILES)
 
 
 class Gate:
-    """Watches the connections of bound sockets, in a thread of its own."""
+    """Watches the connections of bound sockets, in a thread of its own.
+
+    Where they are encrypted, who has shown no key is a stranger; else there are none.
+    """
 
     def __init__(
         self,
@@ -103,14 +102,6 @@ class Gate:
         encrypted: bool,
         counters: Counters,
     ) -> None:
-        """Begin to watch.
-
-        Args:
-            sockets: bound.
-            room: for connections.
-            encrypted: who has shown no key is a stranger; else there are none.
-            counters: what was ended.
-        """
         self._sockets, self._room, self._counters = sockets, room, counters
         self._encrypted = encrypted
         self._open, self._moved = set[int](), 0.0

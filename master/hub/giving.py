@@ -21,7 +21,7 @@ from master.hub.security import (
 )
 from master.record.audit import write_line
 from master.record.rundir import RunFolder
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import UNREADABLE, ConfigError, RunError
 from tangram_core.store.files import private, write_whole
 from tangram_core.wire.messages import ROLES
 
@@ -126,7 +126,7 @@ def _content(path: Path, otherwise: dict[str, Any]) -> dict[str, Any]:
     """Of a connection file."""
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError):
+    except UNREADABLE:
         return otherwise
 
 

@@ -136,11 +136,7 @@ class Hub:
         return size * len(self._registry) / BROADCAST_BYTES_S
 
     def poll(self, timeout_s: float) -> list[Arrival]:
-        """Wait for a message, then take and answer what is there.
-
-        Returns:
-            New batches and scores, in the order of their arrival.
-        """
+        """Wait for a message, answer what is there; returns what is new, in the order it came."""
         arrivals: list[Arrival] = []
         self._sockets.listen_again()
         self._admission.drop_revoked()  # first: a flood must not keep anybody in
@@ -170,11 +166,7 @@ class Hub:
             self._sockets.answer(peer.identity, Ack(arrival.sequence, duplicate=False))
 
     def publish(self, weights: Weights) -> None:
-        """Broadcast weights, and keep them for those who join later.
-
-        Raises:
-            WireError: they are not finite or too large; nothing is sent.
-        """
+        """Broadcast weights, and keep them for those who join later; WireError as in encoding."""
         self._weights = WeightsMessage(self.epoch, weights).encode()
         self._version = weights.version
         self._exams.published(weights.version)
@@ -205,11 +197,7 @@ class Hub:
         return self._registry.state()
 
     def load_state(self, state: Mapping[str, Mapping[str, int | str]]) -> None:
-        """Take the table of duplicates of a checkpoint, before the first poll.
-
-        Raises:
-            RunError: malformed.
-        """
+        """Take a checkpoint's table of duplicates, before the first poll; RunError if malformed."""
         self._registry.load_state(state, time.monotonic())
 
     def recover(self, arrival: EpisodesArrived) -> bool:

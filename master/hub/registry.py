@@ -27,12 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class RefusedError(TangramError):
-    """A process that may not take part.
-
-    Attributes:
-        counter: that counts such refusals.
-        answer: to the process.
-    """
+    """A process that may not take part: the counter of such refusals, and the answer to it."""
 
     def __init__(self, counter: str, answer: Refused | Stop) -> None:
         super().__init__(answer.reason)
@@ -44,12 +39,8 @@ class Peer:
     """A connected process.
 
     Attributes:
-        role, index: its key.
-        incarnation: of its index.
         process: its random id.
-        identity: of its connection.
         last_seen: monotonic seconds.
-        ledger: of its batches.
         stats: numbers of its last heartbeat.
         weights_version: that its last batch was played with.
         batches, episodes, transitions: inserted since it joined.
@@ -110,18 +101,13 @@ class Peer:
 class Registry:
     """Peers by connection and by index, and the ledger of batches of each, for a checkpoint.
 
+    After a restart indices wait `grace_s` for their workers.
+
     Attributes:
         lost_batches: numbers that a checkpoint had not seen and a worker has no more.
     """
 
     def __init__(self, fingerprints: Mapping[str, str], grace_s: float, room: Room = AMPLE) -> None:
-        """Nobody takes part yet.
-
-        Args:
-            fingerprints: section of the settings -> digest; a process must have the same.
-            grace_s: after a restart, how long indices wait for their workers.
-            room: for peers.
-        """
         self._room, self._crowded = room, False
         self.lost_batches = 0
         self._fingerprints = fingerprints
@@ -218,11 +204,7 @@ class Registry:
         }
 
     def load_state(self, state: Mapping[str, Mapping[str, int | str]], now: float) -> None:
-        """Take the ledgers of a checkpoint; their indices wait for their workers for a while.
-
-        Raises:
-            RunError: malformed.
-        """
+        """Take a checkpoint's ledgers, whose indices wait for their workers; or RunError."""
         self._ledgers = {_key(name): _ledger(name, entry) for name, entry in state.items()}
         self._reserved_until = now + self._grace_s
 
@@ -254,11 +236,11 @@ class Registry:
             log.warning(text, taken, most, self._room.bound, extra=fields)
 
     def _check_settings(self, hello: Hello) -> None:
-        odd = differing(self._fingerprints, hello.fingerprints)
+        ours, theirs = self._fingerprints, hello.fingerprints
+        odd = sorted(n for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n))
         if not odd:
             return
         listed = ", ".join(odd)
-        ours, theirs = self._fingerprints, hello.fingerprints
         digests = (
             f"{n}: the worker has {theirs.get(n, 'none')}, the master {ours.get(n, 'none')}"
             for n in odd
@@ -316,11 +298,6 @@ class Askers:
             return False
         self._told[identity] = now
         return True
-
-
-def differing(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """Names of the sections whose digests are not equal."""
-    return sorted(n for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n))
 
 
 def _key(name: str) -> Key:

@@ -27,7 +27,7 @@ from zmq.utils import z85
 
 from master.record.audit import Audit
 from master.record.counters import Counters
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import UNREADABLE, ConfigError, RunError
 from tangram_core.run.process import Every
 from tangram_core.run.service import ServiceConfig
 from tangram_core.store.files import own_folder, write_whole
@@ -55,12 +55,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Given:
-    """A key that was made for somebody, who alone has its secret half.
-
-    Attributes:
-        role: that it may take part in.
-        public: the other half.
-    """
+    """A key for a role that was made for somebody, who alone has its secret half."""
 
     role: str
     public: str
@@ -68,11 +63,9 @@ class Given:
 
 @dataclass(frozen=True)
 class Keys:
-    """The keys of a run.
+    """The keys of a run: of the master, of its own workers by role, and those that were given.
 
     Attributes:
-        server: of the master.
-        player, evaluator: of the run's own workers, by role.
         given: name -> key, of those that tangram-keys made.
         path: where they are kept; changes there are followed.
     """
@@ -124,11 +117,7 @@ def holders(keys: Keys) -> dict[str, Holder]:
 
 
 def run_keys(path: Path) -> Keys:
-    """The keys of a run; made, and kept in a file that only the user may read, the first time.
-
-    Raises:
-        RunError: the file is there and holds something else.
-    """
+    """The keys of a run, see `read_keys`; made, for the user alone to read, the first time."""
     if not path.exists():
         write_keys(path, make_keys())
     return read_keys(path)
@@ -149,17 +138,7 @@ def read_keys(path: Path) -> Keys:
                 raise ValueError(f"'{name}' is no name, or its role is unknown")
             if len(z85.decode(one.public)) != KEY_BYTES:
                 raise ValueError(f"the key of {name} is none")
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-        struct.error,
-        KeyError,
-        msgspec.MsgspecError,
-        zmq.ZMQError,
-    ) as error:
+    except (*UNREADABLE, struct.error, msgspec.MsgspecError, zmq.ZMQError) as error:
         raise RunError(
             f"{path} does not hold the run's keys ({error}): delete it to make new ones; workers "
             "that run now must then be started again"
@@ -173,11 +152,7 @@ def write_keys(path: Path, keys: Keys) -> None:
 
 
 def needs_keys(service: ServiceConfig) -> bool:
-    """Whether who takes part must show a key: always, but on the sockets of one user.
-
-    Raises:
-        ConfigError: this ZeroMQ knows no keys.
-    """
+    """Whether who takes part must show a key, as on any address; ConfigError if ZeroMQ cannot."""
     wanted = service.bind != LOCAL and service.auth == "on"
     if wanted and not zmq.has("curve"):
         raise ConfigError(
@@ -192,10 +167,6 @@ def listening_place(bind: str, run: Path) -> str:
 
     They lie in a folder that only this user may enter, and not in the run's, whose file system may
     be shared and whose path too long. A run has the same ones in each of its lives.
-
-    Args:
-        bind: as it was set.
-        run: folder of the run, which is there.
 
     Raises:
         TangramError: the folder of the sockets cannot be used.
@@ -244,11 +215,7 @@ class _Asked(ThreadAuthenticator):
 
 
 class Authenticator:
-    """Encrypts sockets of a context, and turns away those with another key.
-
-    Attributes:
-        keys: as their file has them by now.
-    """
+    """Encrypts sockets of a context, and turns away those with another key than its file has."""
 
     def __init__(
         self,

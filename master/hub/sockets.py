@@ -16,8 +16,7 @@ from tangram_core.run.process import Every
 from tangram_core.store.files import own_folder
 from tangram_core.wire.addresses import IPC, KEEPALIVE
 from tangram_core.wire.arrays import MAX_FRAME_BYTES
-from tangram_core.wire.messages import Greet, Refused, Reject, Stop
-from tangram_core.wire.schema import Plain
+from tangram_core.wire.schema import Message
 
 LINGER_MS = 1000
 # Messages queued for each peer and direction; what a peer has no room for it must ask for again.
@@ -35,8 +34,6 @@ class Received(NamedTuple):
     """A message, and who it is from.
 
     Attributes:
-        identity: of the connection.
-        frames: of the message.
         holder: of the key that the connection showed, which may be revoked since.
         address: of the other side; of a unix socket `local` and the id of its process.
     """
@@ -48,12 +45,7 @@ class Received(NamedTuple):
 
 
 class Sockets:
-    """A bound ROUTER and a bound PUB.
-
-    Attributes:
-        endpoint: of the ROUTER.
-        weights_endpoint: of the PUB.
-    """
+    """A bound ROUTER, and a bound PUB for weights."""
 
     def __init__(
         self,
@@ -148,13 +140,11 @@ class Sockets:
                 raise
             self._counters["unreachable"] += 1
 
-    def answer(self, identity: bytes, answer: Plain) -> None:
+    def answer(self, identity: bytes, answer: Message) -> None:
         """Send a message to a peer; see `send`."""
         self.send(identity, answer.encode())
 
-    def refuse(
-        self, identity: bytes, counter: str, answer: Reject | Refused | Stop | Greet
-    ) -> None:
+    def refuse(self, identity: bytes, counter: str, answer: Message) -> None:
         """Send a reason, count it and tell it."""
         self._counters.note(counter, getattr(answer, "reason", "a connection without HELLO"))
         self.answer(identity, answer)

@@ -18,13 +18,6 @@ class Budget:
     """
 
     def __init__(self, config: MasterConfig, trainer: Trainer, record: Record) -> None:
-        """Count nothing: the counters are read where they are.
-
-        Args:
-            config: has the bounds.
-            trainer: counts episodes and updates.
-            record: counts the loop's seconds.
-        """
         self._trainer, self._record = trainer, record
         self.max_seconds = config.max_hours * HOUR_S
         self.max_episodes = config.max_episodes

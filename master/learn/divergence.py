@@ -51,11 +51,7 @@ class DivergenceGuard:
         return self._tally[UNDONE]
 
     def update(self, share: float) -> dict[str, float]:
-        """One update; its losses, none if it was undone.
-
-        Raises:
-            RunError: it was one failure too many.
-        """
+        """One update; its losses, none if it was undone; RunError if one too many was."""
         try:
             losses = self.trainer.update(share)
         except NotFiniteError as error:
@@ -66,11 +62,7 @@ class DivergenceGuard:
         return losses
 
     def weights(self) -> Weights:
-        """The acting weights, which are finite.
-
-        Raises:
-            RunError: they were not, one time too many.
-        """
+        """The acting weights, which are finite; RunError if they were not, one time too many."""
         weights = self.trainer.weights()
         try:
             _check_finite(weights.tensors, weights.version)
@@ -80,11 +72,7 @@ class DivergenceGuard:
         return weights
 
     def check(self) -> None:
-        """Keep the present state if it is finite, else go back to the one kept before.
-
-        Raises:
-            RunError: it was one failure too many.
-        """
+        """Keep the state if it is finite, else go back to the one before; or RunError."""
         state = self.trainer.learner.state()
         try:
             _check_finite(state, self.trainer.updates)
@@ -97,17 +85,14 @@ class DivergenceGuard:
         self._tally.note(UNDONE, str(error))
         self._in_a_row += 1
         if self._in_a_row >= self._limit:
+            batch = {name: np.array(one) for name, one in self.trainer.learner.evidence().items()}
+            write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
             raise RunError(
                 f"{error}; {self._in_a_row} times in a row, so the run ends. The last batch is in "
-                f"{self._write_batch()}: {self.trainer.learner.advice}, and go on from the last "
+                f"{self._evidence}: {self.trainer.learner.advice}, and go on from the last "
                 "checkpoint with resume=auto"
             )
         self.trainer.go_back(self._good)
-
-    def _write_batch(self) -> Path:
-        batch = {name: np.array(one) for name, one in self.trainer.learner.evidence().items()}
-        write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
-        return self._evidence
 
 
 def _check_finite(arrays: Mapping[str, npt.NDArray[Any]], updates: int) -> None:

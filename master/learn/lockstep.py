@@ -15,19 +15,13 @@ from tangram_core.wire.messages import Go
 
 
 class Lockstep:
-    """The rounds of a run.
+    """The rounds of a run, in which each of N players, 0 to N - 1, plays `batch_episodes`.
 
     Attributes:
         ordered: the players of this round know what to play.
     """
 
     def __init__(self, players: int, batch_episodes: int) -> None:
-        """Begin with the first round.
-
-        Args:
-            players: N, with the indices 0 to N - 1.
-            batch_episodes: episodes that each plays in a round.
-        """
         self._players, self._size = players, batch_episodes
         self._arrived: dict[int, EpisodesArrived] = {}
         self.ordered = False

@@ -83,11 +83,7 @@ class RateLimiter:
         return {"transitions": self.transitions, "updates": self.updates, "due": self._due()}
 
     def load_state(self, state: Mapping[str, float]) -> None:
-        """Take the counters of a checkpoint.
-
-        Raises:
-            RunError: a counter is missing or negative.
-        """
+        """Take the counters of a checkpoint; RunError if one is missing or negative."""
         values = [state.get(name, -1.0) for name in ("transitions", "updates", "due")]
         if not all(math.isfinite(value) and value >= 0 for value in values):
             raise RunError(

@@ -25,10 +25,7 @@ class Trainer:
     """The learner and everything that its next update depends on.
 
     Attributes:
-        setup: the task and the agent.
         compiled: whether updates are compiled; a run stays with what it began with.
-        learner: the agent's.
-        rate_limiter: decides whether to learn or to take in episodes.
         episodes: taken in since the run began.
     """
 
@@ -130,11 +127,7 @@ class Trainer:
 
 
 def choose_device(wanted: str) -> str:
-    """`auto` is a GPU where there is one.
-
-    Raises:
-        ConfigError: a GPU is wanted and there is none.
-    """
+    """`auto` is a GPU where there is one; ConfigError where one is wanted and there is none."""
     if wanted == "cpu":
         return "cpu"
     if torch.cuda.is_available():

@@ -26,13 +26,9 @@ MAX_EVALUATORS = 16  # that score the same weights
 
 @dataclass(frozen=True, eq=False)
 class EpisodesArrived:
-    """A new batch that waits for its insert; its arrays are read-only.
+    """A new batch of a sender that waits for its insert; its arrays are read-only.
 
-    Attributes:
-        role, index, incarnation: of its sender.
-        batch: as it was read.
-        frames: as they came, for the journal.
-        process: random id of its sender.
+    The frames are as they came, for the journal.
     """
 
     role: str
@@ -154,14 +150,12 @@ class Ledger:
 
 
 class Waiting:
-    """Batches that wait for their insert, of all processes that have an index one after another."""
+    """Batches that wait for their insert, of all processes that have an index one after another.
+
+    At most a window of one index.
+    """
 
     def __init__(self, window: int) -> None:
-        """None yet.
-
-        Args:
-            window: most of one index.
-        """
         self._window, self._of = window, Counter[tuple[str, int]]()
 
     def add(self, key: tuple[str, int]) -> None:

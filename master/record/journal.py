@@ -36,7 +36,7 @@ from tangram_core.run.process import Every
 from tangram_core.store.files import is_same, make_folders, sync_folder
 from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
-from tangram_core.wire.schema import MAX_COUNT, Plain
+from tangram_core.wire.schema import MAX_COUNT, Message
 
 FORMAT = 4
 SUFFIX = ".log"
@@ -61,14 +61,8 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Title(Plain):
-    """What a segment is of.
-
-    Attributes:
-        format: of the journal.
-        run_id: of the run.
-        task: digest of what the arrays belong to.
-    """
+class Title(Message):
+    """What a segment is of; the task is a digest of what the arrays belong to."""
 
     kind: ClassVar[str] = "segment"
     format: Count
@@ -77,7 +71,7 @@ class Title(Plain):
 
 
 @dataclass(frozen=True)
-class Entry(Plain):
+class Entry(Message):
     """Who sent the batch that follows."""
 
     kind: ClassVar[str] = "batch"
@@ -264,9 +258,5 @@ def segment_path(folder: Path, number: int) -> Path:
 def _record(header: Title | Entry, number: int, frames: Sequence[bytes]) -> bytes:
     [packed] = header.encode()
     body = b"".join([LENGTH.pack(len(packed)), packed, join_frames(frames)])
-    return _head(len(body), number, zlib.crc32(body)) + body
-
-
-def _head(length: int, number: int, checksum: int) -> bytes:
-    head = HEAD.pack(MAGIC, length, number, checksum, 0)[: -CRC.size]
-    return head + CRC.pack(zlib.crc32(head))
+    head = HEAD.pack(MAGIC, len(body), number, zlib.crc32(body), 0)[: -CRC.size]
+    return head + CRC.pack(zlib.crc32(head)) + body

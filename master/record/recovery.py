@@ -6,7 +6,6 @@ of the records tell how many batches are missing. See `journal` for what a segme
 """
 
 import os
-import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -32,18 +31,13 @@ from tangram_core.wire.arrays import split_frames
 from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tangram_core.wire.schema import ProtocolError, opened, read
 
-OLD_HEAD = struct.Struct("<II")  # of formats 1 and 2: length and CRC of the body
 CHUNK = 2**20
 MAX_GAP = 2**32  # a number further on than this was forged
 ANOTHER = "choose another run_dir, or delete its folder journal to go on without it"
 
 
 def journal_run_id(folder: Path) -> str | None:
-    """The run that a journal is of; None where there is no journal, or no title in it.
-
-    Raises:
-        RunError: it is of another format.
-    """
+    """The run that a journal is of; None where there is none. RunError if of another format."""
     return next((title.run_id for _, title in _titles(folder)), None)
 
 
@@ -93,8 +87,7 @@ class Reader:
         Args:
             folder: of the segments.
             after: which a checkpoint names; None for the whole journal.
-            run_id: that the segments must be of.
-            task: digest that they must carry.
+            run_id, task: that the segments must be of.
             spec: of the arrays.
             warn: takes a line for each loss, and for a record that was cut short.
         """
@@ -104,11 +97,7 @@ class Reader:
         self._trouble: _Trouble | None = None
 
     def __iter__(self) -> Iterator[EpisodesArrived]:
-        """Read.
-
-        Raises:
-            RunError: another run, task or format, or the disk cannot be read.
-        """
+        """Read; RunError for another run, task or format, or a disk that cannot be read."""
         try:
             found = {n: p for n, p in segments(self._folder).items() if n >= self._first}
             expected = self._first
@@ -133,7 +122,10 @@ class Reader:
                 self._lost(f"{where} (it says that it is batch {found.number:,})")
                 continue
             if found.body is None:
-                self._lost(where, found.number, _cut_short(path, found) if found.torn else "")
+                size = f"{found.end - found.start:,} bytes"
+                torn = f"{path} is cut short at byte {found.start:,} ({size}), as a kill leaves it"
+                torn += ": dropped, it was not acknowledged"
+                self._lost(where, found.number, torn if found.torn else "")
                 continue
             try:
                 title = _title(path, found)
@@ -218,11 +210,7 @@ class _Found(NamedTuple):
 
 
 def _scan(path: Path) -> Iterator[_Found]:
-    """All parts of a segment, in order.
-
-    Raises:
-        RunError: it is of an older format.
-    """
+    """All parts of a segment, in order."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
         start, size = 0, os.fstat(file.fileno()).st_size
@@ -240,8 +228,6 @@ def _scan(path: Path) -> Iterator[_Found]:
                 whole = end <= (end := min(end, _next_head(file, start + 1, size)))
                 yield _Found(start, end, number if whole else 0, None, not whole)
             else:
-                if not start and _is_old(file, size):
-                    raise RunError(f"{path} is of an older version of tangram-rl: {ANOTHER}")
                 end = _next_head(file, start + 1, size)
                 yield _Found(start, end, 0, None, end - start < HEAD.size)
             start = end
@@ -273,25 +259,9 @@ def _next_head(file: BinaryIO, start: int, size: int) -> int:
     return size
 
 
-def _is_old(file: BinaryIO, size: int) -> bool:
-    """Whether a file begins with a record of format 1 or 2."""
-    file.seek(0)
-    head = file.read(OLD_HEAD.size)
-    length, checksum = OLD_HEAD.unpack(head) if len(head) == OLD_HEAD.size else (0, 0)
-    body = file.read(min(length, size))
-    return bool(body) and len(body) == length and zlib.crc32(body) == checksum
-
-
 def _missing(path: Path, count: int) -> str:
     more = f" and the {count - 1:,} after it are" if count > 1 else " is"
     return f"{path}{more} missing"
-
-
-def _cut_short(path: Path, found: _Found) -> str:
-    return (
-        f"{path} is cut short at byte {found.start:,} ({found.end - found.start:,} bytes), as a "
-        "kill leaves it: dropped, it was not acknowledged"
-    )
 
 
 def _batches(count: int, least: bool) -> str:

@@ -30,20 +30,17 @@ def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
     if not found:
         if segments(folder.journal):  # it was killed before its first checkpoint
             check_journal(folder.journal, make_setup(resolved).task_digest())
-        _check_warm_start(resolved.get("warm_start"))
+        other = resolved.get("warm_start")
+        if other is not None and not list_checkpoints(Path(other) / CHECKPOINTS):
+            raise RunError(
+                f"warm_start={other} has no checkpoint: name the folder of a run that was trained"
+            )
         return
     try:
         counters = load_checkpoint(found[-1], stems=[]).counters
     except CorruptError:
         return  # the one before decides, when the run is restored
     check_same_task(make_setup(resolved), counters.get(SETUP, {}))
-
-
-def _check_warm_start(run_dir: str | None) -> None:
-    if run_dir is not None and not list_checkpoints(Path(run_dir) / CHECKPOINTS):
-        raise RunError(
-            f"warm_start={run_dir} has no checkpoint: name the folder of a run that was trained"
-        )
 
 
 def check_same_task(setup: Setup, contents: Mapping[str, Any]) -> None:

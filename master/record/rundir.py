@@ -32,13 +32,8 @@ class RunFolder:
     """Paths of a run folder.
 
     Attributes:
-        path: the folder.
-        config: the resolved config.
         connection: where the master can be reached; there while it runs.
-        keys: of encrypted sockets.
-        checkpoints: folder of the checkpoints.
-        journal: folder of what came since.
-        tensorboard: folder of the curves.
+        journal: folder of what came since the last checkpoint.
         logs: folder of the output of workers and evaluator.
         curve: the scores of every evaluation.
         audit: who joined, left and was refused.
@@ -65,11 +60,7 @@ class RunFolder:
         self.again: dict[Path, Callable[[], object]] = {}
 
     def prepare(self, resume: str) -> None:
-        """Make the folder.
-
-        Raises:
-            ConfigError: it holds a run and `resume` is none, or it cannot be made.
-        """
+        """Make the folder; ConfigError if that fails, or a run is there that is not to go on."""
         if resume == "none" and self.holds_run():
             raise ConfigError(
                 f"run_dir {self.path} holds a run already: choose another run_dir, or go on with "
@@ -118,11 +109,7 @@ class RunFolder:
         return spent and result["scored_updates"] == result["updates"]
 
     def lock(self) -> "Claim":
-        """Claim the folder for one process; the claim ends with the process or with `close`.
-
-        Raises:
-            ConfigError: another process works here.
-        """
+        """Claim the folder for one process, until `close` or its end; ConfigError if it is used."""
         return Claim(self)
 
     def write_again(self) -> None:
@@ -150,11 +137,7 @@ class RunFolder:
         return dict(yaml.safe_load(data))
 
     def write_connection(self, connection: Mapping[str, Any]) -> None:
-        """Write what a worker needs to take part; only the user may read it.
-
-        Args:
-            connection: where the master is; the settings of the run are added to it.
-        """
+        """Write where the master is, and the run's settings; only the user may read it."""
         config = self.read_config()
         shared = (*section_names(config), "service")
         settings = {name: config[name] for name in shared if name in config}
@@ -176,11 +159,7 @@ class FolderError(RunError):
 
 
 class Claim:
-    """A run folder in which no other process works, as long as it is the one that was claimed.
-
-    Attributes:
-        run: the folder.
-    """
+    """A run folder in which no other process works, as long as it is the one that was claimed."""
 
     def __init__(self, run: RunFolder) -> None:
         """Claim a folder; ConfigError if another process works there."""
@@ -273,11 +252,7 @@ class Record:
 
     @staticmethod
     def of(state: Mapping[str, Any]) -> "Record":
-        """The record in a checkpoint.
-
-        Raises:
-            RunError: it lacks a field, or one is of another type.
-        """
+        """The record in a checkpoint; RunError if it lacks a field, or one is of another type."""
         lacking = [f.name for f in fields(Record) if f.name not in state]
         if lacking:
             raise RunError(
@@ -294,11 +269,7 @@ class Record:
 
 
 class Clock:
-    """Adds the time of this process to a record.
-
-    Attributes:
-        record: of the run.
-    """
+    """Adds the time of this process to the record of a run."""
 
     def __init__(self, record: Record) -> None:
         self.record, self._wall_s = record, record.wall_s

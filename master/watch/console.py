@@ -8,7 +8,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol, TextIO, cast
+from typing import Any, TextIO, TypeAlias, cast
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -95,13 +95,7 @@ class _ConsoleHandler(logging.Handler):
 
 @contextmanager
 def logging_to(console: Console, log_format: str = "text", who: str = "master") -> Iterator[None]:
-    """Show the log lines of this room on a console.
-
-    Args:
-        console: where to.
-        log_format: text, or json.
-        who: name of the process in JSON.
-    """
+    """Show the log lines of this room on a console, in JSON with the name of the process."""
     logger, handler = logging.getLogger("master"), _ConsoleHandler(console)
     handler.setFormatter(_TextFormatter() if log_format == "text" else formatter(log_format, who))
     before = logger.level
@@ -117,26 +111,12 @@ def logging_to(console: Console, log_format: str = "text", who: str = "master") 
 # The state of the run
 
 
-class Progress(Protocol):
-    """Shows how a run stands until it is closed."""
-
-    def show(self, status: RunStatus) -> None:
-        """Show a status; cheap, and may be called as often as one likes."""
-
-    def close(self) -> None:
-        """Leave the terminal as it was found."""
-
-
 def make_progress(
     console: Console, title: str, log_format: str = "text", evaluator: str = ""
-) -> Progress:
+) -> "Progress":
     """A live panel where the console is a terminal; lines of the log elsewhere, and for JSON.
 
-    Args:
-        console: where to.
-        title: of the panel.
-        log_format: text, or json.
-        evaluator: command that starts one, shown while nobody scores; empty if one will come.
+    The panel shows the command that starts an evaluator while nobody scores.
     """
     if console.is_terminal and log_format == "text":
         return LivePanel(console, title, evaluator)
@@ -185,6 +165,9 @@ class LivePanel:
 
     def _draw(self, status: RunStatus) -> None:
         self._live.update(status_panel(status, self._title, self._evaluator), refresh=True)
+
+
+Progress: TypeAlias = StatusLines | LivePanel
 
 
 def status_line(status: RunStatus) -> str:

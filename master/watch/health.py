@@ -31,22 +31,16 @@ log = logging.getLogger(__name__)
 
 
 class Health:
-    """A small HTTP server in threads of its own.
+    """A small HTTP server in threads of its own; port 0 is any free one.
 
     Attributes:
         url: where it listens.
+
+    Raises:
+        ConfigError: the address cannot be used.
     """
 
     def __init__(self, bind: str, port: int) -> None:
-        """Listen.
-
-        Args:
-            bind: address.
-            port: 0 for any free one.
-
-        Raises:
-            ConfigError: the address cannot be used.
-        """
         self._status: RunStatus | None = None
         self._seen_s = time.monotonic()
         self._registry = CollectorRegistry()

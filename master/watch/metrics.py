@@ -58,18 +58,12 @@ class Means:
 class Metrics:
     """Writes the curves of one run: to TensorBoard, and evaluations to curve.jsonl, too.
 
-    What the disk does not take is left out, and told: curves are not worth a run.
+    What the disk does not take is left out, and told: curves are not worth a run. Points of an
+    earlier process after the checkpoint that the run goes on from, with so many updates, are hidden
+    or dropped, since they happen again.
     """
 
     def __init__(self, folder: Path, curve: Path, updates: int = 0) -> None:
-        """Open the files.
-
-        Args:
-            folder: of the event files.
-            curve: the file of evaluations; made with the first one.
-            updates: of the checkpoint that the run goes on from; later points of an earlier
-                process are hidden or dropped, since they happen again.
-        """
         self._folder, self._curve = folder, curve
         self._hook, threading.excepthook = threading.excepthook, self._thread_failed
         kept = [line for line in _lines(curve) if line["updates"] <= updates]
@@ -125,9 +119,7 @@ class Metrics:
     def hyperparameters(self, result: Mapping[str, Any], facts: Collection[str]) -> None:
         """What runs are compared by in the HPARAMS tab, and which curves end in their scores.
 
-        Args:
-            result: of the run, as in result.json.
-            facts: names in it of what tells task and agent.
+        `facts` are the names in result.json of what tells task and agent.
         """
         values = {name: _plain(result[name]) for name in (*HPARAMS, *facts)}
         tags = {f"test/{score.name}": 0.0 for score in read(result["scores"])[:SHOWN]}

@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -56,16 +55,6 @@ class StatusCollector:
         clock: Clock,
         checkpointer: Checkpointer,
     ) -> None:
-        """Collect nothing yet.
-
-        Args:
-            name: of the run.
-            guard: of the trainer.
-            hub: counts messages, and knows who takes part.
-            budget: of the run.
-            clock: of the run, with its record.
-            checkpointer: knows how old the last checkpoint is.
-        """
         self._name, self._guard, self._hub, self._budget = name, guard, hub, budget
         self._clock, self._checkpointer = clock, checkpointer
         self._rates = Rates()
@@ -163,13 +152,7 @@ def _row(peer: Peer, now_s: float, updates: int) -> list[float]:
 
 @dataclass(frozen=True)
 class Sent:
-    """The state of the run when weights were sent.
-
-    Attributes:
-        at_s: monotonic time.
-        episodes: taken in by then.
-        train_s: seconds of training by then.
-    """
+    """Monotonic time, episodes taken in and seconds of training when weights were sent."""
 
     at_s: float
     episodes: int
@@ -177,7 +160,10 @@ class Sent:
 
 
 class Reporter:
-    """Collects what happens between two reports, and passes them on."""
+    """Collects what happens between two reports, and passes them on.
+
+    Listeners get the status about once in a second; `picture` is where test episodes are drawn.
+    """
 
     def __init__(
         self,
@@ -189,19 +175,8 @@ class Reporter:
         listeners: Sequence[Callable[[RunStatus], None]],
         picture: Path,
     ) -> None:
-        """Report nothing yet.
-
-        Args:
-            trainer: which learns.
-            record: takes the scores.
-            status: of the run.
-            progress: for the user.
-            metrics: the curves.
-            listeners: get the status about once in a second.
-            picture: where the newest test episodes are drawn.
-        """
         self._trainer, self._record, self._status = trainer, record, status
-        self._progress, self._metrics, self._listeners = progress, metrics, listeners
+        self._progress, self.metrics, self._listeners = progress, metrics, listeners
         self._losses, self._play = Means(), Means()
         self._tick, self._listen = Every(TICK_S, at_once=True), Every(LISTEN_S, at_once=True)
         self._log, self._picture = Every(LOG_S), Every(PICTURE_S, at_once=True)
@@ -238,11 +213,11 @@ class Reporter:
         values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
         updates = scores.weights_version
         sent = self._published.get(updates, self._now())
-        self._metrics.scores(values, updates, sent.episodes, sent.train_s)
+        self.metrics.scores(values, updates, sent.episodes, sent.train_s)
         # Writing it takes time from learning.
         if len(scores.picture) and self._picture.due():
             half = Image.fromarray(scores.picture).reduce(2)
-            self._metrics.picture(np.asarray(half), updates)
+            self.metrics.picture(np.asarray(half), updates)
             with suppress(RunError):  # a disk that fails is told where the run needs it
                 self.draw()
 
@@ -275,23 +250,11 @@ class Reporter:
         for name, value in status.numbers.items():
             if not name.startswith((TEST, PLAYED)):  # those are written when they come
                 values[name if "/" in name else f"run/{name}"] = value
-        self._metrics.scalars(values, self._trainer.updates)
+        self.metrics.scalars(values, self._trainer.updates)
         return status
 
-    def settings(self, resolved: Mapping[str, Any]) -> None:
-        """Write the whole config beside the curves."""
-        self._metrics.settings(resolved)
-
-    def hyperparameters(self, result: Mapping[str, Any]) -> None:
-        """Write what runs are compared by."""
-        self._metrics.hyperparameters(result, self._trainer.facts())
-
     def draw(self) -> None:
-        """Write the picture of the last evaluation, where there is one.
-
-        Raises:
-            RunError: the disk does not take it.
-        """
+        """Write the picture of the last evaluation, if any; RunError if the disk is full."""
         if self._latest is not None and len(self._latest.picture):
             drawn = BytesIO()
             Image.fromarray(self._latest.picture).save(drawn, "PNG")

@@ -42,13 +42,7 @@ def make_result(
     """The content of result.json; scores are null where no evaluator sent any.
 
     `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
-
-    Args:
-        status: at the end of the run.
-        scores: that the task declares.
-        facts: of what has learned.
-        seed: of the run.
-        reason: of its end.
+    `facts` are those of the trainer.
     """
     n = status.numbers
     scored = int(n["scored_updates"])
@@ -81,12 +75,7 @@ def show_result(
 ) -> None:
     """The final table, where everything lies, and what to do with it.
 
-    Args:
-        console: where to.
-        folder: of the run.
-        result: content of its result.json.
-        code: see `code_of`.
-        go_on: command that goes on with it; shown where a signal has ended it.
+    `go_on` is the command that goes on with it; shown where a signal has ended it.
     """
     table = Table(show_header=False, box=None, padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)

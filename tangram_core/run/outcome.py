@@ -5,35 +5,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tangram_core.errors import RunError
+from tangram_core.errors import UNREADABLE, RunError
 from tangram_core.scores import read
 
 FILE_NAME = "result.json"
 BOUNDS = ("max_hours", "max_episodes", "max_updates")
 ROWS = 6  # of scores
-FAULTS = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    RecursionError,
-)
 CTRL_C = {"SIGINT": "Ctrl-C (SIGINT)"}
 
 
 def read_outcome(path: Path) -> dict[str, Any]:
-    """The content of a result.json, which has all that `outcome_rows` and `bound_of` need.
-
-    Raises:
-        RunError: it cannot be read, or is none.
-    """
+    """A result.json that has all that `outcome_rows` and `bound_of` need; else RunError."""
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
         outcome_rows(result)
         bound_of(result)
-    except FAULTS as error:
+    except UNREADABLE as error:
         raise RunError(
             f"{path} is no result of a run ({error!r}): name another folder, or "
             "delete the file, without which resume=auto goes on from the last checkpoint"

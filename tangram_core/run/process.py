@@ -14,7 +14,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Self
 
 from pythonjsonlogger.json import JsonFormatter
@@ -72,9 +73,7 @@ class Lifeline:
 def watch_parent(on_line: Callable[[str], None] | None = None, grace_s: float = GRACE_S) -> bool:
     """Start the child's side: SIGTERM to itself at the parent's end, and after grace_s the end.
 
-    Args:
-        on_line: takes each line that the parent sends; called in the watching thread.
-        grace_s: seconds that an orderly end may take.
+    `on_line` takes each line that the parent sends, in the watching thread.
 
     Returns:
         Whether there is a parent to watch.
@@ -117,15 +116,11 @@ class Watchdog:
     """Ends a process that lives but makes no progress, with the stacks of all threads on stderr.
 
     The clock runs in a thread of C that needs no interpreter, so it also sees a process that hangs
-    in an extension. Whoever started the process sees it end, and starts it again.
+    in an extension. Whoever started the process sees it end, and starts it again. It begins to
+    watch when it is entered; 0 seconds is never.
     """
 
     def __init__(self, seconds: float) -> None:
-        """Make the watchdog; it begins to watch when it is entered.
-
-        Args:
-            seconds: without progress before the end; 0 is never.
-        """
         self._seconds, self._wound_s = seconds, 0.0
 
     def __enter__(self) -> Self:
@@ -147,6 +142,26 @@ class Watchdog:
             faulthandler.dump_traceback_later(self._seconds, exit=True, file=STDERR)
 
 
+@contextmanager
+def handling(
+    handle: Callable[[signal.Signals], None], numbers: Iterable[signal.Signals]
+) -> Iterator[None]:
+    """These signals call a function, until what was there before is put back.
+
+    Not those that are ignored: nohup and scripts let children ignore some.
+    """
+    before = {
+        number: signal.signal(number, lambda n, _frame: handle(signal.Signals(n)))
+        for number in numbers
+        if signal.getsignal(number) != signal.SIG_IGN
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def keep_memory() -> None:
     """Keep memory that was freed for what comes next; other C libraries than glibc do as they do.
 
@@ -161,14 +176,10 @@ def keep_memory() -> None:
 
 
 def formatter(log_format: str, who: str) -> logging.Formatter:
-    """How a process writes its lines.
+    """How a process writes its lines, in one of `FORMATS`.
 
     JSON lines have `time` (ISO 8601, UTC), `level`, `process`, `event`, `message`, and the fields
     of the event, which callers give to the logger as `extra`.
-
-    Args:
-        log_format: one of `FORMATS`.
-        who: name of the process.
     """
     if log_format == "json":
         return JsonFormatter(

@@ -51,12 +51,7 @@ class DiskError(RunError):
 
 
 class CorruptError(RunError):
-    """A checkpoint that is not as it was written.
-
-    Attributes:
-        path: the checkpoint.
-        why: the file and what is wrong with it.
-    """
+    """A checkpoint that is not as it was written; `why` names the file and what is wrong."""
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"checkpoint {path} is corrupt ({why}): delete it to use the one before")
@@ -68,8 +63,6 @@ class Checkpoint:
     """What one checkpoint folder holds.
 
     Attributes:
-        path: the folder.
-        updates: of the learner when it was written.
         arrays: file stem -> tensor name -> array; only the stems that were asked for.
         counters: everything that is no tensor, as it was passed to `save_checkpoint`.
     """
@@ -100,7 +93,8 @@ def save_checkpoint(
     aside = folder / f"{_TEMPORARY}{updates:08d}"
     try:
         make_folders(folder, above=False)
-        _drop_temporary(folder)
+        for left in folder.glob(f"{_TEMPORARY}*"):
+            shutil.rmtree(left)
         aside.mkdir()
         _write_content(aside, updates, arrays, counters)
         final = _free_name(folder, updates)
@@ -127,11 +121,7 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def newest_checkpoint(folder: Path) -> Path:
-    """The newest checkpoint, whether or not its content is whole.
-
-    Raises:
-        RunError: there is none.
-    """
+    """The newest checkpoint, whether or not its content is whole; RunError if there is none."""
     found = list_checkpoints(folder)
     if not found:
         raise RunError(f"no checkpoint in {folder}: train the run first, or name another run_dir")
@@ -178,11 +168,6 @@ def _free_name(folder: Path, updates: int) -> Path:
     orders = map(_order, list_checkpoints(folder))
     again = max((number for found, number in orders if found == updates), default=-1) + 1
     return folder / (f"{updates:08d}-{again}" if again else f"{updates:08d}")
-
-
-def _drop_temporary(folder: Path) -> None:
-    for path in folder.glob(f"{_TEMPORARY}*"):
-        shutil.rmtree(path)
 
 
 def _write_content(

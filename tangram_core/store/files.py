@@ -12,13 +12,9 @@ PUBLIC = 0o644
 
 
 def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True) -> None:
-    """Replace a file, or make it and its folders; nothing is left behind when that fails.
+    """Replace a file, or make it; nothing is left behind when that fails.
 
-    Args:
-        path: the file.
-        data: its whole content.
-        mode: its permissions.
-        above: make the folders that are missing.
+    With `above` the folders that are missing are made, too.
 
     Raises:
         RunError: the disk is full or the folder cannot be written.
@@ -45,15 +41,7 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True)
 
 
 def make_folders(folder: Path, above: bool = True) -> None:
-    """Make a folder where it is missing, with its name on the disk.
-
-    Args:
-        folder: the folder.
-        above: make those above it, too, where they are missing.
-
-    Raises:
-        OSError: it cannot be made, or a file is in the way.
-    """
+    """Make a folder, and with `above` those above it, with its name on the disk; or OSError."""
     try:
         folder.mkdir(exist_ok=True)
     except FileNotFoundError:
@@ -75,12 +63,7 @@ def private(path: str, flags: int) -> int:
 
 
 def check_writable(name: str, path: Path) -> None:
-    """Raise ConfigError unless `write_whole` could write a file there; nothing is left behind.
-
-    Args:
-        name: of the setting that names the file.
-        path: the file; folders that are missing would be made.
-    """
+    """Raise ConfigError, which names the setting, unless `write_whole` could write a file there."""
     try:
         if path.is_dir():
             raise IsADirectoryError(0, "it is a folder")
@@ -95,11 +78,7 @@ def check_writable(name: str, path: Path) -> None:
 
 
 def own_folder(path: Path) -> None:
-    """Make a folder that only this user may enter, or see that one is there.
-
-    Raises:
-        RunError: it is another user's, open to others, no folder, or cannot be made.
-    """
+    """Make a folder that only this user may enter, or see that one is there; or RunError."""
     try:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
@@ -133,11 +112,7 @@ def _aside(path: Path) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk: without this a power cut undoes a rename.
-
-    Raises:
-        OSError: the disk is broken or full.
-    """
+    """Wait until a folder's names are on the disk: a power cut would undo a rename; or OSError."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

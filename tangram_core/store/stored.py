@@ -13,11 +13,7 @@ MAX_DEPTH = 20
 
 
 def load_settings(text: str, source: str) -> Any:
-    """The content of a YAML text.
-
-    Raises:
-        ConfigError: it is no YAML, or more of it than settings are.
-    """
+    """The content of a YAML text; ConfigError if it is none, or more of it than settings are."""
     try:
         check_extent(text, source)
         return yaml.safe_load(text)
@@ -27,11 +23,7 @@ def load_settings(text: str, source: str) -> Any:
 
 
 def check_extent(text: str, source: str) -> None:
-    """Refuse a text of more than so many values, however often its aliases repeat them.
-
-    Raises:
-        ConfigError: it is too long, too large or too deep.
-    """
+    """ConfigError for a text of more than so many values, however often its aliases repeat them."""
     large = len(text) > MAX_TEXT
     total, sizes, begun = 0, dict[str | None, int](), list[tuple[str | None, int]]()
     for event in () if large else yaml.parse(text, yaml.SafeLoader):

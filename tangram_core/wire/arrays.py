@@ -74,11 +74,7 @@ class Column:
         return float(self.native.type(self.low)), float(self.native.type(self.high))
 
     def encode(self, array: npt.NDArray[Any]) -> bytes:
-        """The array's frame.
-
-        Raises:
-            WireError: another shape, or a value out of bounds.
-        """
+        """The array's frame; WireError for another shape, or a value out of bounds."""
         if array.shape != self.shape:
             raise WireError(f"{self.name} must have the shape {self.shape}, got {array.shape}")
         array = np.ascontiguousarray(array)  # else each of what follows would copy it
@@ -86,11 +82,7 @@ class Column:
         return array.astype(self.dtype, copy=False).tobytes()
 
     def decode(self, frame: bytes) -> npt.NDArray[Any]:
-        """The array in a frame, as a read-only view.
-
-        Raises:
-            WireError: another size, or a value out of bounds.
-        """
+        """The array in a frame, as a read-only view; WireError as in `encode`."""
         if len(frame) != self.size:
             raise WireError(
                 f"{self.name} must have {self.size} bytes for the shape {self.shape}, "
@@ -152,11 +144,7 @@ def check_batch_size(spec: EpisodeSpec, count: int = 1) -> None:
 def encode_columns(
     arrays: Mapping[str, npt.NDArray[Any]], columns: Sequence[Column]
 ) -> list[bytes]:
-    """Raw frames of arrays by name, column by column; large ones are cut.
-
-    Raises:
-        WireError: an array that a receiver would refuse.
-    """
+    """Raw frames of arrays by name; large ones are cut. WireError for what would be refused."""
     whole = [column.encode(arrays[column.name]) for column in columns]
     if all(column.frames == 1 for column in columns):
         return whole
@@ -170,11 +158,7 @@ def encode_columns(
 def decode_columns(
     frames: Sequence[bytes], columns: Sequence[Column]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Arrays by name.
-
-    Raises:
-        WireError: another number of frames, or a frame that breaks its column.
-    """
+    """Arrays by name; WireError for another number of frames, or one that breaks its column."""
     count = sum(column.frames for column in columns)
     if len(frames) != count:
         raise WireError(f"there must be {count} array frames, got {len(frames)}")
@@ -185,11 +169,7 @@ def decode_columns(
 
 
 def encode_tensors(tensors: Mapping[str, Singles]) -> bytes:
-    """Weights as one frame of safetensors.
-
-    Raises:
-        WireError: a tensor is not finite, or they are too large.
-    """
+    """Weights as one frame of safetensors; WireError if they are not finite, or too large."""
     plain = {name: np.array(t, np.float32, order="C") for name, t in tensors.items()}
     _check_finite(plain)
     data = save(plain)
@@ -201,11 +181,7 @@ def encode_tensors(tensors: Mapping[str, Singles]) -> bytes:
 
 
 def decode_tensors(frame: bytes, shapes: WeightShapes | None) -> dict[str, Singles]:
-    """The tensors in a frame made by `encode_tensors`.
-
-    Args:
-        frame: of at most MAX_WEIGHTS_BYTES.
-        shapes: what the tensors must be; None takes any.
+    """The tensors in a frame made by `encode_tensors`, of these shapes; None takes any.
 
     Raises:
         WireError: names the tensor and what is wrong with it.
@@ -213,24 +189,6 @@ def decode_tensors(frame: bytes, shapes: WeightShapes | None) -> dict[str, Singl
     if len(frame) > MAX_WEIGHTS_BYTES:
         raise WireError(f"weights: {len(frame)} bytes, at most {MAX_WEIGHTS_BYTES}")
     tensors = load_tensors(frame, "weights")
-    _check_tensors(tensors, shapes)
-    return tensors
-
-
-def load_tensors(data: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
-    """The tensors in data of safetensors, whoever wrote it.
-
-    Raises:
-        WireError: it is none; begins with the name.
-    """
-    try:
-        return load(data)
-    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
-    except (SafetensorError, KeyError, ValueError) as error:
-        raise WireError(f"{name}: not safetensors: {error}") from None
-
-
-def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: WeightShapes | None) -> None:
     for name, tensor in tensors.items():
         if tensor.dtype != np.float32:
             raise WireError(f"weights: {name!r} must be float32, got {tensor.dtype}")
@@ -241,6 +199,16 @@ def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: WeightShapes | 
             if wanted != got:
                 raise WireError(f"weights: {name[:80]!r} must be {wanted}, got {got}")
     _check_finite(tensors)
+    return tensors
+
+
+def load_tensors(data: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
+    """The tensors in data of safetensors; WireError, which begins with the name, if it is none."""
+    try:
+        return load(data)
+    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise WireError(f"{name}: not safetensors: {error}") from None
 
 
 def _check_finite(tensors: dict[str, npt.NDArray[Any]]) -> None:
@@ -255,11 +223,7 @@ def join_frames(frames: Iterable[bytes]) -> bytes:
 
 
 def split_frames(data: bytes) -> list[bytes]:
-    """The frames that `join_frames` joined.
-
-    Raises:
-        WireError: a frame is cut short, or there are too many.
-    """
+    """What `join_frames` joined; WireError if a frame is cut short, or there are too many."""
     frames, start = list[bytes](), 0
     while start < len(data):
         if len(frames) == MAX_FRAMES:

@@ -34,8 +34,8 @@ from tangram_core.wire.schema import (
     Between,
     Bound,
     Flag,
+    Message,
     Numbers,
-    Plain,
     Table,
     Text,
     Texts,
@@ -61,11 +61,7 @@ OPEN = "service.auth=off: open to whoever reaches the port"
 
 
 class BatchError(WireError):
-    """An intact batch whose content is refused: it would be wrong again if it were sent again.
-
-    Attributes:
-        sequence: number of the batch.
-    """
+    """An intact batch, of this number, whose content is refused: it would be wrong again."""
 
     def __init__(self, sequence: int, reason: str) -> None:
         super().__init__(reason)
@@ -86,16 +82,8 @@ YesOrNo = Annotated[bool, Flag()]
 # Messages
 
 
-class OfTask(Table):
-    """A message whose arrays belong to the task."""
-
-    def encode(self, spec: EpisodeSpec) -> list[bytes]:
-        """The message's frames; WireError for content that a receiver would refuse."""
-        return self.frames(spec)
-
-
 @dataclass(frozen=True)
-class Hello(Plain):
+class Hello(Message):
     """A process asks to take part, or to go on after it lost the master.
 
     Attributes:
@@ -119,7 +107,7 @@ class Hello(Plain):
 
 
 @dataclass(frozen=True)
-class WantWeights(Plain):
+class WantWeights(Message):
     """A worker asks for the current weights unless they are of this epoch and version."""
 
     kind: ClassVar[str] = "want_weights"
@@ -128,7 +116,7 @@ class WantWeights(Plain):
 
 
 @dataclass(frozen=True)
-class Heartbeat(Plain):
+class Heartbeat(Message):
     """A sign of life with numbers for the master's log; answered by Alive."""
 
     kind: ClassVar[str] = "heartbeat"
@@ -136,7 +124,7 @@ class Heartbeat(Plain):
 
 
 @dataclass(frozen=True)
-class Bye(Plain):
+class Bye(Message):
     """A worker leaves of its own accord."""
 
     kind: ClassVar[str] = "bye"
@@ -144,21 +132,15 @@ class Bye(Plain):
 
 
 @dataclass(frozen=True)
-class AskStatus(Plain):
+class AskStatus(Message):
     """Anybody asks how the run stands; no HELLO is needed."""
 
     kind: ClassVar[str] = "ask_status"
 
 
 @dataclass(frozen=True, eq=False)
-class EpisodeBatch(OfTask):
-    """Whole episodes, as played.
-
-    Attributes:
-        sequence: number of the batch, from 1 within an incarnation.
-        weights_version: of the weights that played it; -1 for none.
-        episodes: the arrays.
-    """
+class EpisodeBatch(Table):
+    """Whole episodes as played, numbered from 1 within an incarnation; version -1: no weights."""
 
     kind: ClassVar[str] = "episodes"
     sequence: Number
@@ -194,7 +176,7 @@ class EpisodeBatch(OfTask):
 
 
 @dataclass(frozen=True, eq=False)
-class Scores(OfTask):
+class Scores(Table):
     """Results of one evaluation.
 
     Attributes:
@@ -220,7 +202,7 @@ class Scores(OfTask):
 
 
 @dataclass(frozen=True)
-class Welcome(Plain):
+class Welcome(Message):
     """The master takes a process in.
 
     Attributes:
@@ -246,7 +228,7 @@ class Welcome(Plain):
 
 
 @dataclass(frozen=True)
-class Go(Plain):
+class Go(Message):
     """In lockstep, what a player plays next; it may come more than once.
 
     Attributes:
@@ -264,7 +246,7 @@ class Go(Plain):
 
 
 @dataclass(frozen=True)
-class Refused(Plain):
+class Refused(Message):
     """The master does not take a process in."""
 
     kind: ClassVar[str] = "refused"
@@ -272,14 +254,14 @@ class Refused(Plain):
 
 
 @dataclass(frozen=True)
-class Greet(Plain):
+class Greet(Message):
     """The master does not know this connection (it was restarted): say HELLO again."""
 
     kind: ClassVar[str] = "greet"
 
 
 @dataclass(frozen=True)
-class Ack(Plain):
+class Ack(Message):
     """A batch is in the replay, now or since before (duplicate)."""
 
     kind: ClassVar[str] = "ack"
@@ -288,7 +270,7 @@ class Ack(Plain):
 
 
 @dataclass(frozen=True)
-class Reject(Plain):
+class Reject(Message):
     """A message is refused.
 
     Attributes:
@@ -305,19 +287,15 @@ class Reject(Plain):
 
 
 @dataclass(frozen=True)
-class Alive(Plain):
-    """The answer to a heartbeat.
-
-    Attributes:
-        version: of the newest broadcast, -1 before the first: one that missed it can ask.
-    """
+class Alive(Message):
+    """The answer to a heartbeat, by whose version one that missed the newest broadcast can ask."""
 
     kind: ClassVar[str] = "alive"
     version: Version
 
 
 @dataclass(frozen=True)
-class Stop(Plain):
+class Stop(Message):
     """The worker must end."""
 
     kind: ClassVar[str] = "stop"
@@ -325,13 +303,8 @@ class Stop(Plain):
 
 
 @dataclass(frozen=True, eq=False)
-class WeightsMessage(Plain):
-    """The newest weights.
-
-    Attributes:
-        epoch: of the master that made them.
-        weights: the tensors.
-    """
+class WeightsMessage(Message):
+    """The newest weights, and the epoch of the master that made them."""
 
     kind: ClassVar[str] = "weights"
     epoch: Id
@@ -370,7 +343,7 @@ WORKER_COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class RunStatus(Table, Plain):
+class RunStatus(Table):
     """How a run stands. What a receiver would refuse is left out or cut, see Numbers.
 
     Attributes:
@@ -431,9 +404,7 @@ def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> 
         shapes: of the tensors that weights must have; None takes any.
 
     Raises:
-        ProtocolError: the master speaks another version.
-        DamagedError: the message was changed on its way.
-        WireError: anything else that is wrong; the reason names the field.
+        WireError: as in `decode_from_worker`.
     """
     return cast("ToWorker", received(frames, _FROM_MASTER, shapes))
 

@@ -128,8 +128,8 @@ class Numbers(Bound):
     def check(self, where: str, value: Any) -> dict[str, float]:
         """All as floats."""
         for key, number in _entries(where, value):
-            # Comparisons with NaN are false.
-            if not (_is_number(number) and -MAX_NUMBER <= number <= MAX_NUMBER):
+            known = isinstance(number, int | float) and not isinstance(number, bool)
+            if not (known and -MAX_NUMBER <= number <= MAX_NUMBER):  # nor NaN
                 raise _wrong(f"{where}.{key}", "a finite number", number)
         return {key: float(number) for key, number in value.items()}
 
@@ -214,19 +214,11 @@ class Message:
         check_frames(cls.kind, frames, 0)
         return cls(**values)
 
-    def frames(self, agreed: Any) -> list[bytes]:
-        """The whole message, checked as the receiver will check it."""
+    def encode(self, agreed: Any = None) -> list[bytes]:
+        """The message's frames, of arrays as agreed on; WireError for what would be refused."""
         more, arrays = self.pack(agreed)
         values = {name: getattr(self, name) for name in self.bounds}
         return seal(self.kind, _checked(type(self), {**values, **more}, agreed), arrays)
-
-
-class Plain(Message):
-    """A message that can be read without knowing the task."""
-
-    def encode(self) -> list[bytes]:
-        """The message's frames; WireError for content that a receiver would refuse."""
-        return self.frames(None)
 
 
 class Table(Message):
@@ -277,11 +269,7 @@ def by_kind(union: Any) -> dict[str, type[Message]]:
 def read(
     cls: type[Kind], header: Mapping[str, Any], frames: Sequence[bytes] = (), agreed: Any = None
 ) -> Kind:
-    """The message of an opened header and of the frames after it.
-
-    Raises:
-        WireError: another kind, or content out of bounds; the reason names the field.
-    """
+    """The message of an opened header and the frames after it; WireError names the wrong field."""
     if header["kind"] != cls.kind:
         raise WireError(f"expected {cls.kind}, got a message of kind {header['kind']!r}")
     values = {name: value for name, value in header.items() if name != "kind"}
@@ -321,11 +309,7 @@ def _checked(cls: type[Message], values: dict[str, Any], agreed: Any) -> dict[st
 
 
 def seal(kind: str, fields: Mapping[str, object], frames: Sequence[bytes]) -> list[bytes]:
-    """The header {v, kind, fields..., crc} and the frames.
-
-    Raises:
-        WireError: the header would be larger than a receiver accepts.
-    """
+    """The header {v, kind, fields..., crc} and the frames; WireError if it is too large."""
     largest = 2**32 - 1  # packed at the length of every checksum above 2^16
     header: bytes = msgpack.packb({"v": PROTOCOL, "kind": kind, **fields, "crc": largest})
     if len(header) > MAX_HEADER:
@@ -422,10 +406,6 @@ def _entries(where: str, values: Any) -> Collection[tuple[str, Any]]:
 
 def _is_name(key: Any) -> bool:
     return isinstance(key, str) and NAME.fullmatch(key) is not None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _cut(text: str, size: int) -> str:

@@ -12,8 +12,9 @@ from rich.console import Console
 
 from master.children import Child, command, describe, override
 from master.record.rundir import RunFolder
-from master.signals import handling
+from master.signals import SIGNALS
 from tangram_core.errors import ConfigError
+from tangram_core.run.process import handling
 from tangram_core.store.files import write_whole
 from tangram_lab.experiments.rows import COLUMNS, CURVE, append, curve_rows, done, rows_of
 from tangram_lab.experiments.studies import Job, StudyConfig
@@ -133,7 +134,7 @@ class Runner:
 
     def run(self) -> int:
         """Until nothing is left to do; returns the exit status."""
-        with handling(self._events.put):
+        with handling(self._events.put, SIGNALS):
             try:
                 self._work()
             finally:

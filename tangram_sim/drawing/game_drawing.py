@@ -60,7 +60,7 @@ def draw_game(
     size: int = 320,
     held: Held | None = None,
 ) -> Image.Image:
-    """One square picture of the pieces over the silhouette of their target.
+    """One square picture of the pieces over the silhouette of their target, `size` pixels wide.
 
     Args:
         layout: which corners belong to which token.
@@ -71,7 +71,12 @@ def draw_game(
         held: the piece that is moved, drawn above the others.
     """
     canvas = empty_table(size * SAMPLES)
-    _draw_silhouette(canvas, to_outlines(layout, arena, goal, canvas.width))
+    # The target as one figure: its fill hides the inner half of every piece's edge.
+    targets = to_outlines(layout, arena, goal, canvas.width)
+    for target in targets:
+        draw_outline(canvas, target, _EDGE, 2.0)
+    for target in targets:
+        fill(canvas, target, SILHOUETTE, 1.0)
     for k, piece in enumerate(to_outlines(layout, arena, corners, canvas.width)):
         if held is None or k != held.token:
             fill(canvas, piece, colour_of(k), _OPACITY)
@@ -87,11 +92,7 @@ def figure_sheet(
 ) -> Image.Image:
     """One picture for each of E figures, with its name and how much of it is covered below.
 
-    Args:
-        layout: which corners belong to which token.
-        arena: width of the arena.
-        ends, goals: (E, V, 2) corners of tokens and targets.
-        titles: E names.
+    `ends` and `goals` are corners (E, V, 2) of tokens and targets.
     """
     columns, size = tiles(len(ends), _SHEET)
     pictures = [
@@ -110,14 +111,6 @@ def tiles(count: int, width: int) -> tuple[int, int]:
     """How many pictures stand in a row of so many pixels, and the side of each in pixels."""
     columns = min(math.ceil(math.sqrt(1.4 * count)), count)
     return columns, min(max(width // columns, _MIN_TILE), _MAX_TILE)
-
-
-def _draw_silhouette(canvas: Image.Image, targets: Sequence[Sequence[Point]]) -> None:
-    """The target as one figure: its fill hides the inner half of every piece's edge."""
-    for target in targets:
-        draw_outline(canvas, target, _EDGE, 2.0)
-    for target in targets:
-        fill(canvas, target, SILHOUETTE, 1.0)
 
 
 def _draw_held(canvas: Image.Image, arena: float, held: Held, corners: Floats) -> None:

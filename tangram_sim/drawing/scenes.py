@@ -87,12 +87,8 @@ def episode_sheet(
 ) -> Image.Image:
     """One picture for each of E episodes with its overlap below, and one legend for all of them.
 
-    Args:
-        layout: which corners belong to which token.
-        arena: width of the arena.
-        starts, ends, goals: (E, V, 2) corners of tokens and targets.
-        columns: pictures in a row.
-        size: side of one picture in pixels.
+    `starts`, `ends` and `goals` are corners (E, V, 2) of tokens and targets; `size` is the side of
+    one picture in pixels.
     """
     starts, ends, goals = (np.asarray(part, np.float64) for part in (starts, ends, goals))
     scenes = [
@@ -185,11 +181,7 @@ def contact_sheet(
 def save_gif(
     images: Sequence[Image.Image], target: Path | BinaryIO, milliseconds: int = 400
 ) -> None:
-    """An endless animation, every picture shown for `milliseconds`.
-
-    Raises:
-        ValueError: no pictures.
-    """
+    """An endless animation of at least one picture, each shown for `milliseconds`."""
     if not images:
         raise ValueError("an animation needs at least one picture")
     # One palette for all frames, from frames all over the film: colours must not flicker.
@@ -209,12 +201,7 @@ def save_gif(
 
 
 def save_mp4(images: Sequence[Image.Image], target: BinaryIO, milliseconds: int = 400) -> None:
-    """A film in H.264, which every browser and slide shows, every picture for `milliseconds`.
-
-    Raises:
-        ValueError: no pictures.
-        ImportError: PyAV is not installed.
-    """
+    """A film in H.264, which every browser and slide shows; ImportError if PyAV is missing."""
     if not images:
         raise ValueError("a film needs at least one picture")
     import av  # noqa: PLC0415 - optional

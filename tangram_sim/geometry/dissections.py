@@ -33,13 +33,7 @@ _GROWN = 1.5  # tolerances that a token may reach out of what is left
 
 
 class Laid(NamedTuple):
-    """A token in its place.
-
-    Attributes:
-        shape: number among the different shapes.
-        flipped: whether it lies on its other side.
-        pose: (3,) x, y and angle.
-    """
+    """A token of a shape, by its number, on one side, in its place: pose (3,) is x, y and angle."""
 
     shape: int
     flipped: bool
@@ -111,12 +105,10 @@ class Corner:
 
 @dataclass
 class Budget:
-    """What a search may cost, and what it did.
+    """What a search may cost, and what it did, in steps.
 
     Attributes:
         until: when it ends, see `time.thread_time`.
-        nodes: steps that it may take.
-        taken: steps that were taken.
     """
 
     until: float
@@ -181,13 +173,7 @@ class Search:
     """
 
     def __init__(self, tokens: Tokens, tolerance: float, budget: Budget) -> None:
-        """Search with a tolerance: how far an outline's sides may be from where they should be.
-
-        Args:
-            tokens: that fill the outline.
-            tolerance: in its units.
-            budget: what it may cost.
-        """
+        """Allow an outline's sides to be off by a tolerance, in the units of the outline."""
         self._tokens, self._tolerance, self.budget = tokens, tolerance, budget
         self._least = float(tokens.areas.min())
         self.best: list[Laid] = []
@@ -198,7 +184,9 @@ class Search:
         yield from self._fill(valid(outline), self._tokens.counts, [])
 
     def _fill(self, rest: Area, left: tuple[int, ...], laid: list[Laid]) -> Iterator[list[Laid]]:
-        self._remember(laid)
+        area = float(sum(self._tokens.areas[one.shape] for one in laid))
+        if area > self._most:
+            self.best, self._most = laid, area
         parts = parts_of(rest, self._least)
         if not parts:
             if not any(left):
@@ -215,12 +203,7 @@ class Search:
                 return
 
     def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        """All that may lie at the corner of what is left where least may, and what then is left.
-
-        Args:
-            rest: what is left to fill.
-            left: how many tokens there are of each shape.
-        """
+        """All that may lie at the corner where least may, and what then is left to fill."""
         parts = parts_of(rest, self._least)
         if not parts or not self.fits(rest, left):
             return []
@@ -240,11 +223,6 @@ class Search:
 
     def _without(self, rest: Area, polygon: Polygon) -> Area:
         return without(rest, polygon, self._tolerance, self._tokens.unit)
-
-    def _remember(self, laid: list[Laid]) -> None:
-        area = float(sum(self._tokens.areas[one.shape] for one in laid))
-        if area > self._most:
-            self.best, self._most = laid, area
 
     def _divides(self, areas: Sequence[float], left: tuple[int, ...]) -> bool:
         """Whether tokens that are left have the areas of all parts."""
@@ -313,11 +291,7 @@ def parts_of(rest: Area, least: float) -> list[Polygon]:
 def without(rest: Area, laid: Area, tolerance: float, unit: float) -> Area:
     """What tokens leave of what was left, without slivers narrower than two tolerances.
 
-    Args:
-        rest: what was left.
-        laid: the tokens in their places.
-        tolerance: in their units.
-        unit: the root of all tokens' area.
+    The unit is the root of all tokens' area.
     """
     return opened(shapely.difference(rest, laid, grid_size=_GRID * unit), tolerance)
 

@@ -48,9 +48,7 @@ def kind_of(name: str) -> str:
 def fit_piece(kind: str, corners: Floats) -> Fit:
     """The rigid motion with the least squared distance of the corners, over all assignments.
 
-    Args:
-        kind: one of `VARIANTS`.
-        corners: (V, 2), V the number of the shape's corners, in any order and direction.
+    The corners (V, 2) of a kind of `VARIANTS` come in any order and direction.
     """
     fits = [_fit_shape(name, corners) for name in VARIANTS[kind]]
     return min(fits, key=lambda pair: pair[0])[1]

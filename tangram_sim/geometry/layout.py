@@ -48,11 +48,7 @@ class TokensConfig(Settings, section="tokens"):
 
 
 def make_layout(config: TokensConfig) -> "Layout":
-    """The layout of a token set.
-
-    Raises:
-        ConfigError: an unknown shape, or a polygon that is not convex.
-    """
+    """The layout of a token set; ConfigError if a shape is unknown, or not convex."""
     return Layout([_shape(entry).scaled(config.scale) for entry in config.shapes])
 
 
@@ -184,32 +180,6 @@ class Layout:
         image = np.asarray(poses) * (1.0, -1.0, -1.0)
         image[..., 2] += turns
         return image, np.asarray(flipped) ^ self.chiral
-
-    def node_features(self, corners: Floats, placed: Bools, goal: Floats) -> Floats:
-        """The 4 features per node of Sec. IV-A: x, y, part of the target, placed.
-
-        Args:
-            corners: (..., V, 2) of the tokens.
-            placed: (..., K) which tokens are placed.
-            goal: (..., V, 2) corners of the target; its nodes always count as placed.
-
-        Returns:
-            (..., N, 4)
-        """
-        positions = np.concatenate([corners, self.bases(corners), goal], axis=-2)
-        lead, v = positions.shape[:-2], self.corner_count
-        target = np.zeros((*lead, self.nodes))
-        target[..., v + self.tokens :] = 1.0
-        flags = np.concatenate(
-            [placed[..., self.token_of_corner], placed, np.ones((*lead, v))], axis=-1
-        )
-        return np.concatenate([positions, target[..., None], flags[..., None]], axis=-1)
-
-    def state_matrix(self, corners: Floats, placed: Bools, goal: Floats) -> Floats:
-        """Nodes and adjacency stacked, as the paper passes them on: (..., N, 4 + N)."""
-        nodes = self.node_features(corners, placed, goal)
-        edges = np.broadcast_to(self.adjacency, (*nodes.shape[:-1], self.nodes))
-        return np.concatenate([nodes, edges], axis=-1)
 
     def fingerprint(self) -> str:
         """A short digest of the shapes: two processes with the same one agree on every index."""

@@ -118,11 +118,7 @@ def union_area(tokens: Floats, layout: Layout) -> Floats:
 def _covered(own: Floats, rows: Ints, pieces: Floats, last: Ints) -> Floats:
     """(B,) summed area of the parts of pieces (P, M, 2) that tokens (B, K, C, 2) cover.
 
-    Args:
-        own: outlines of the tokens.
-        rows: (P,) whose piece it is.
-        pieces: outlines.
-        last: (P,) only tokens behind this one count.
+    `rows` (P,) say whose piece it is; only tokens behind `last` (P,) count.
     """
     total, sign, count = np.zeros(len(own)), 1.0, own.shape[1]
     for _ in range(count):

@@ -22,12 +22,9 @@ _GRID = 1e-7  # of it, to which corners are rounded
 
 
 def covered_area(corners: Floats, layout: Layout, tokens: Bools | None = None) -> Area:
-    """What tokens cover together, gaps closed.
+    """What tokens with corners (V, 2) cover together, gaps closed.
 
-    Args:
-        corners: (V, 2) of all tokens.
-        layout: the tokens.
-        tokens: (K,) those that count; None: all do.
+    `tokens` (K,) are those that count; None: all do.
     """
     pieces = outlines(np.asarray(corners, np.float64)[None], layout)[0]
     counted = pieces if tokens is None else pieces[tokens]
@@ -43,11 +40,7 @@ def unit_of(layout: Layout) -> float:
 
 
 def as_rows(area: Area, layout: Layout, most: int) -> Floats:
-    """Corners (G, 2) of an area's rings, `most` of them.
-
-    Raises:
-        ConfigError: it has too many.
-    """
+    """Corners (G, 2) of an area's rings, `most` of them; ConfigError if it has too many."""
     # Where rings begin is not to tell of the pieces.
     every = [z for z, _, _ in rings(shapely.normalize(area), _STRAIGHT * unit_of(layout))]
     joined = np.concatenate([np.append(z, z[0]) for z in every]) if every else np.zeros(1, complex)

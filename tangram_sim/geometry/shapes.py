@@ -93,11 +93,7 @@ def turn_onto(corners: Floats, image: Floats) -> float | None:
 
 
 def polygon(name: str, corners: Sequence[Sequence[float]]) -> Shape:
-    """A user-defined shape from its corners, in either direction and anywhere in the plane.
-
-    Raises:
-        ConfigError: fewer than 3 or more than 16 corners, not finite, or not strictly convex.
-    """
+    """A user's shape of 3 to 16 corners, in either direction; ConfigError if it is not convex."""
     points = _checked_points(name, corners)
     if polygon_area(points) < 0:
         points = points[::-1]
@@ -163,11 +159,7 @@ SHAPE_NAMES = tuple(_TANS)
 
 
 def tan(name: str) -> Shape:
-    """One of the tans by name, for a full square of side 1.
-
-    Raises:
-        ConfigError: the name is not one of `SHAPE_NAMES`.
-    """
+    """One of the tans by name, for a full square of side 1; ConfigError if there is none."""
     if name not in _TANS:
         raise ConfigError(
             f"unknown shape '{name}': choose from {', '.join(SHAPE_NAMES)}, "

@@ -17,13 +17,11 @@ from tangram_sim.config import SimConfig
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """What B environments are to do.
+    """What B environments are to do: which token (B,) moves, or none where they are idle.
 
     Attributes:
-        tokens: (B,) which one moves.
         velocity: (B, 3) in arena units and radians a second.
         flip: (B,) whether it is turned over.
-        idle: (B,) where nothing moves.
     """
 
     tokens: Ints
@@ -66,7 +64,8 @@ class Actuation:
     def carry_out(self, command: Command) -> Command:
         """What this step carries out of what it was told, or of what the one before was."""
         if self._dynamics.delayed:
-            command, self.pending = self.pending or _nothing(command), command
+            nothing = replace(command, idle=np.ones_like(command.idle))
+            command, self.pending = self.pending or nothing, command
         self.carried = command
         return replace(command, velocity=self.told(command.velocity))
 
@@ -96,7 +95,3 @@ def reach(sim: SimConfig) -> Floats:
 def _uniform(generators: Sequence[np.random.Generator], size: int) -> Floats:
     """(B, size) in [-1, 1)."""
     return np.stack([generator.uniform(-1.0, 1.0, size) for generator in generators])
-
-
-def _nothing(command: Command) -> Command:
-    return replace(command, idle=np.ones_like(command.idle))

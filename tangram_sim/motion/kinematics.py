@@ -9,10 +9,7 @@ from tangram_sim.sight.pictures import averaged, rasterise, taken_pixels
 
 
 class KinematicWorld:
-    """Tokens that go exactly where their velocity takes them, lifted, without contacts.
-
-    See `World`.
-    """
+    """Tokens that go exactly where they are told, lifted, without contacts; see `World`."""
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
         self._layout = layout

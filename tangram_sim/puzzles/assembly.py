@@ -112,16 +112,12 @@ def _centred(
         )
         return None, [f"puzzle '{name}': {fault}"]
     poses[:, :2] -= (corners.min(axis=0) + corners.max(axis=0)) / 2.0
-    return _ordered(name, layout, poses, rules.scale), []
-
-
-def _ordered(name: str, layout: Layout, poses: Floats, scale: float) -> Puzzle:
-    """Pieces in the order of a token set, lengths in arena units."""
+    # Pieces in the order of a token set, lengths in arena units.
     names = [shape.name for shape in layout.shapes]
     order = sorted(range(len(names)), key=lambda k: SHAPE_NAMES.index(names[k]))
-    poses = poses[order] * (scale, scale, 1.0)
+    poses = poses[order] * (rules.scale, rules.scale, 1.0)
     poses.setflags(write=False)  # the library's are shared
-    return Puzzle(name, tuple(names[k] for k in order), poses, scale)
+    return Puzzle(name, tuple(names[k] for k in order), poses, rules.scale), []
 
 
 def _count_faults(sketch: Sketch, rules: PuzzleRules, where: str) -> list[str]:

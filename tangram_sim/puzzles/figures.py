@@ -22,11 +22,7 @@ _MAX_TOLD = 20  # faults in one message
 
 
 def read_puzzles(path: Path, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
-    """The puzzles of a file: one if its name ends in .svg, JSON otherwise.
-
-    Args:
-        path: of the file.
-        rules: the full set of tans by default.
+    """The puzzles of a file: one if its name ends in .svg, JSON otherwise; by default of all tans.
 
     Raises:
         ConfigError: the file cannot be used, or has faults; all of them are named.
@@ -38,12 +34,7 @@ def read_puzzles(path: Path, rules: PuzzleRules | None = None) -> tuple[Puzzle, 
 
 
 def parse_puzzles(text: str, source: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
-    """The puzzles of a JSON text; see `read_puzzles`.
-
-    Args:
-        text: JSON.
-        source: what errors call the file.
-    """
+    """The puzzles of a JSON text, which errors call `source`; see `read_puzzles`."""
     return _built(parse_sketches(text, source), rules or PuzzleRules())
 
 
@@ -73,11 +64,7 @@ def _built(sketches: Sequence[Sketch | list[str]], rules: PuzzleRules) -> tuple[
 
 
 def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
-    """A puzzle of the package.
-
-    Raises:
-        ConfigError: no such puzzle.
-    """
+    """A puzzle of the package; ConfigError if there is none of this name."""
     found = {puzzle.name: puzzle for puzzle in library(None, scale)}
     if name not in found:
         raise ConfigError(f"unknown puzzle '{name}': choose from {', '.join(found)}")
@@ -88,9 +75,7 @@ def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
 def library(split: str | None = None, scale: float = 0.6) -> tuple[Puzzle, ...]:
     """The package's puzzles: train and test have all seven tans, paper has the paper's own.
 
-    Args:
-        split: one of `SPLITS`, or all of them.
-        scale: side of the full square, in arena units.
+    The scale is the side of the full square, in arena units.
 
     Raises:
         ConfigError: an unknown split.

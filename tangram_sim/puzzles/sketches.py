@@ -53,15 +53,7 @@ def check_file(path: Path, source: str) -> None:
 
 
 def read_text(path: Path, source: str | None = None) -> str:
-    """The text of a drawing.
-
-    Args:
-        path: of the file.
-        source: what errors call it; a puzzle file by default.
-
-    Raises:
-        ConfigError: not a file that can be read, too large, or not UTF-8.
-    """
+    """The text of a drawing; ConfigError if it cannot be read, is too large, or no UTF-8."""
     source = source or f"puzzle file {path}"
     check_file(path, source)
     try:
@@ -78,14 +70,10 @@ def read_text(path: Path, source: str | None = None) -> str:
 
 
 def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
-    """The puzzles of a file in its order; for a puzzle that cannot be used, its faults.
-
-    Args:
-        text: JSON.
-        source: what errors call the file.
+    """The puzzles of a JSON text in its order; for a puzzle that cannot be used, its faults.
 
     Raises:
-        ConfigError: nothing of the file can be used.
+        ConfigError: nothing of the file, which errors call `source`, can be used.
     """
     content = loaded(text, source)
     if not isinstance(content, dict) or set(content) != {"format", "version", "puzzles"}:
@@ -98,11 +86,7 @@ def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
 
 
 def loaded(text: str, source: str) -> Any:
-    """What a JSON text holds, no key of a mapping given twice.
-
-    Raises:
-        ConfigError: it is too long, or no JSON.
-    """
+    """What a JSON text holds, no key given twice; ConfigError if it is too long, or no JSON."""
     if len(text) > MAX_BYTES:
         raise ConfigError(f"{source} is longer than {MAX_BYTES} characters: split it")
     try:
@@ -150,7 +134,11 @@ def _sketches(entries: list[Any]) -> list[Sketch | list[str]]:
     names: set[str] = set()
     for i, entry in enumerate(entries):
         try:
-            name = _name_of(entry, f"puzzle number {i + 1}")
+            where = f"puzzle number {i + 1}"
+            if not isinstance(entry, dict) or set(entry) != {"name", "pieces"}:
+                keys = "must have exactly the keys name, pieces"
+                raise FaultError(f"{where} {keys}, got {shown(entry)}")
+            name = checked_name(entry["name"], where)
             if name in names:
                 raise FaultError(
                     f"puzzle '{name}': number {i + 1} has a name that is taken: rename it"
@@ -163,18 +151,8 @@ def _sketches(entries: list[Any]) -> list[Sketch | list[str]]:
     return sketches
 
 
-def _name_of(entry: Any, where: str) -> str:
-    if not isinstance(entry, dict) or set(entry) != {"name", "pieces"}:
-        raise FaultError(f"{where} must have exactly the keys name, pieces, got {shown(entry)}")
-    return checked_name(entry["name"], where)
-
-
 def checked_name(name: Any, where: str) -> str:
-    """The name of a puzzle, checked.
-
-    Raises:
-        FaultError: it is empty, too long, or cannot be printed.
-    """
+    """A puzzle's name; FaultError if it is empty, too long, or cannot be printed."""
     if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME or not name.isprintable():
         raise FaultError(
             f"{where}: name must be 1 to {MAX_NAME} printable characters, got {shown(name)}"
@@ -209,11 +187,7 @@ def _piece(entry: Any, where: str) -> tuple[str, Floats]:
 
 
 def drawn_point(corner: Any, where: str) -> tuple[float, float]:
-    """A corner, checked.
-
-    Raises:
-        FaultError: it is no pair of numbers, or they are not finite or too large.
-    """
+    """A corner; FaultError if it is no pair of finite numbers, or too large."""
     if not isinstance(corner, list) or len(corner) != 2 or not all(map(is_number, corner)):
         raise FaultError(
             f"{where}: a corner must be [x, y], finite and within +-{MAX_COORDINATE:g}, "

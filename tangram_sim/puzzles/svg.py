@@ -38,10 +38,6 @@ _NOT_DRAWN = {"defs", "symbol", "clipPath", "mask", "marker", "pattern", "metada
 def parse_svg(text: str, name: str) -> Sketch:
     """The figure of an SVG file; its seven areas together are one squared unit.
 
-    Args:
-        text: SVG.
-        name: of the puzzle.
-
     Raises:
         ConfigError: not an SVG that can be read.
         FaultError: its polygons are not the seven tans; the fit is not checked here.
@@ -69,11 +65,7 @@ def parse_svg(text: str, name: str) -> Sketch:
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is out of bounds later
 def svg_outlines(text: str, name: str) -> list[Floats]:
-    """All outlines (V, 2) that an SVG draws, y up, each of at least three corners.
-
-    Raises:
-        ConfigError: not an SVG that can be read, or it draws none.
-    """
+    """All outlines (V, 2) that an SVG draws, y up, V >= 3; ConfigError if it draws none."""
     outlines = [
         _outline(element, motion, f"SVG '{name}', polygon {i + 1}") * (1.0, -1.0)
         for i, (element, motion) in enumerate(_polygons(_root(text, name), name))

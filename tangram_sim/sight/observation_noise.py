@@ -17,13 +17,9 @@ def noise_bound(sim: SimConfig) -> float:
 
 
 def see(corners: Floats, sim: SimConfig, generators: Sequence[np.random.Generator]) -> Floats:
-    """Corners (B, V, 2) with independent Gaussian noise on every coordinate.
+    """Corners (B, V, 2), arena units, with independent Gaussian noise on every coordinate.
 
     Without noise these are the corners themselves, and nothing is drawn.
-
-    Args:
-        corners: exact, arena units.
-        generators: one for each of the B environments.
     """
     if sim.corner_noise == 0.0:
         return corners

@@ -73,10 +73,7 @@ class Sight:
     def begin(self, targets: Pixels, states: Pixels, goals: Floats | None = None) -> None:
         """Look at pictures (B, P, P) of targets and starts, or of starts where goals are known.
 
-        Args:
-            targets: pictures of them.
-            states: pictures of the starts.
-            goals: (B, V, 2) as a look before has found them.
+        Goals (B, V, 2) are as a look before has found them.
         """
         self._poses[:], self._flipped[:] = 0.0, False
         self.missing = np.ones_like(self.missing)
@@ -94,12 +91,9 @@ class Sight:
         self.goals, self.goals_sure = self._layout.corners(poses, flipped), sure
 
     def follow(self, states: Pixels, moved: Ints, ways: Floats) -> None:
-        """Look at pictures (B, P, P) after tokens have moved.
+        """Look at pictures (B, P, P) after tokens (B,), as the agent names them, have moved.
 
-        Args:
-            states: the pictures.
-            moved: (B,) tokens, as the agent names them.
-            ways: (B, 3) that they were told to go: x, y and turn.
+        They were told to go ways (B, 3): x, y and turn.
         """
         # What was given away before stays as it is.
         self.missing = self.missing.copy()
@@ -116,9 +110,7 @@ class Sight:
     def hands(self, tokens: Ints, corners: Floats) -> Ints:
         """(B,) which tokens of the world lie where the agent sees tokens (B,): those it would grab.
 
-        Args:
-            tokens: as the agent names them.
-            corners: (B, V, 2) as they are.
+        The corners (B, V, 2) are as they are.
         """
         found, true = tokens.copy(), self._layout.bases(corners)
         for b, token in enumerate(tokens.tolist()):
@@ -162,10 +154,7 @@ class Sight:
 def _nearest(places: Floats, others: Floats, first: Sequence[int]) -> list[int]:
     """For each of places (n, 2) another one of others (m, 2), nearest first; m where none is left.
 
-    Args:
-        places: of n things.
-        others: of m things.
-        first: those of the n that choose before the rest does.
+    Those of the n that are `first` choose before the rest does.
     """
     far = np.linalg.norm(places[:, None] - others[None], axis=-1)
     chosen = [len(others)] * len(places)

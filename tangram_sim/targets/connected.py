@@ -45,13 +45,7 @@ def sample_piles(
     """One layout (K, 3) of piles of one to three tokens edge to edge, at least one of several.
 
     The piles lie at least `PILES_APART` of the arena apart: two pixels of a picture of 128. No
-    token lies on its other side.
-
-    Args:
-        layout: the tokens.
-        sim: the arena.
-        rng: draws it.
-        avoid: (M, C, 2) outlines that piles keep clear of where there is room.
+    token lies on its other side. Where there is room they keep clear of outlines (M, C, 2).
 
     Raises:
         SamplingError: a token does not fit into the arena, or no layout was found in `MAX_TRIES`
@@ -161,7 +155,8 @@ def _attached(
     for _ in range(-(-MAX_TRIES // _CHUNK)):
         turn, shift = _candidates(piece, laid, rng)
         moved = piece.moved(turn[:, None], shift[:, None])
-        free = _apart(moved, laid, _TOUCHING * sim.arena) & (_extent(moved, laid) < sim.arena)
+        extent = np.abs(moved.corners[:, :, None] - laid.corners.ravel()).max(axis=(1, 2))
+        free = _apart(moved, laid, _TOUCHING * sim.arena) & (extent < sim.arena)
         if free.any():
             first = int(np.argmax(free))
             return complex(turn[first]), complex(shift[first])
@@ -203,12 +198,6 @@ def _outside(pieces: _Outlines, others: _Outlines, depth: float) -> Bools:
     gap = others.corners[None, :, None] - pieces.corners[:, None, :, None]
     inwards = (pieces.edges.conj()[:, None, :, None] * gap).imag
     return np.asarray((inwards <= depth).all(axis=-1).any(axis=-1))
-
-
-def _extent(pieces: _Outlines, laid: _Outlines) -> Floats:
-    """(n,) the largest distance between corners of each piece and of the others."""
-    gaps: Floats = np.abs(pieces.corners[:, :, None] - laid.corners.ravel()).max(axis=(1, 2))
-    return gaps
 
 
 def _laid_out(

@@ -23,11 +23,13 @@ MAX_TRIES = 1000  # random poses tried for one token before sampling gives up
 _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
 _CLEAR_TRIES = 64  # outside of what is only to be avoided; then anywhere
 
+Generators = Sequence[np.random.Generator]
+
 
 def sample_batch(
     layout: Layout,
     sim: SimConfig,
-    generators: Sequence[np.random.Generator],
+    generators: Generators,
     flipped: Bools | None = None,
     avoid: Floats | None = None,
 ) -> Floats:
@@ -53,10 +55,13 @@ def sample_batch(
     order = np.argsort(-layout.areas, kind="stable").tolist()
     bodies = layout.body[layout.padded_corners]
     placed: Floats = np.empty((len(generators), 0, *bodies.shape[1:]))
-    draw = _Draw(sim, generators)
     for token in order:
         piece = _Piece(layout.shapes[token].name, bodies[token], reach[token], sides[:, token])
-        _place(piece, placed, avoid, draw, poses[:, token])
+        if not _place(piece, placed, avoid, generators, poses[:, token]):
+            raise SamplingError(
+                f"no room for token '{piece.name}' beside {placed.shape[1]} others in {MAX_TRIES} "
+                f"tries in an arena of width {sim.arena:g}: raise sim.arena, or lower tokens.scale"
+            )
         outline = outlines_at(piece.body, poses[:, token], sides[:, token])
         placed = np.concatenate([placed, outline[:, None]], axis=1)
     return poses
@@ -79,47 +84,32 @@ class _Piece:
     flipped: Bools
 
 
-@dataclass(frozen=True, eq=False)
-class _Draw:
-    """Draws poses, overlapping or not."""
-
-    sim: SimConfig
-    generators: Sequence[np.random.Generator]
-
-    def __call__(self, row: int, size: int, reach: float) -> Floats:
-        """Draw (size, 3) poses for one environment."""
-        rng = self.generators[row]
-        unit: Floats = 1.0 - 2.0 * rng.random((size, 3))  # in (-1, 1]
-        poses: Floats = unit * np.array([reach, reach, np.pi])
-        return poses
-
-
 def _place(
-    piece: _Piece,
-    placed: Floats,
-    avoid: Floats | None,
-    draw: _Draw,
-    poses: Floats,
-) -> None:
-    """Fill the poses (B, 3) of one token, clear of those placed (B, k, C, 2)."""
+    piece: _Piece, placed: Floats, avoid: Floats | None, generators: Generators, poses: Floats
+) -> bool:
+    """Fill the poses (B, 3) of one token, clear of those placed (B, k, C, 2); whether it could."""
     open_rows = np.arange(len(poses))
     if avoid is not None:
         both = np.concatenate([placed, avoid], axis=1)
-        open_rows = _try(piece, both, draw, poses, open_rows, _CLEAR_TRIES)
-    open_rows = _try(piece, placed, draw, poses, open_rows, MAX_TRIES)
-    if len(open_rows):
-        raise _exhausted(piece.name, placed.shape[1], draw.sim)
+        open_rows = _try(piece, both, generators, poses, open_rows, _CLEAR_TRIES)
+    return not len(_try(piece, placed, generators, poses, open_rows, MAX_TRIES))
 
 
 def _try(
-    piece: _Piece, obstacles: Floats, draw: _Draw, poses: Floats, open_rows: Ints, limit: int
+    piece: _Piece,
+    obstacles: Floats,
+    generators: Generators,
+    poses: Floats,
+    open_rows: Ints,
+    limit: int,
 ) -> Ints:
     """Fill the open rows of poses (B, 3) with a free one of `limit` poses; return the rest."""
     chunk = _CHUNK if obstacles.shape[1] else 1
     tries = 0
     while len(open_rows) and tries < limit:
         size = min(chunk, limit - tries)
-        drawn = np.stack([draw(b, size, piece.reach) for b in open_rows.tolist()])
+        unit = np.stack([1.0 - 2.0 * generators[b].random((size, 3)) for b in open_rows.tolist()])
+        drawn = unit * np.array([piece.reach, piece.reach, np.pi])  # angles in (-pi, pi]
         blocked = _blocked(piece, drawn, obstacles[open_rows], piece.flipped[open_rows])
         first = np.argmin(blocked, axis=1)
         free = ~blocked[np.arange(len(open_rows)), first]
@@ -141,11 +131,7 @@ def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) ->
 
 
 def check_fits(layout: Layout, sim: SimConfig) -> Floats:
-    """(K,) largest coordinate of each token's centre.
-
-    Raises:
-        SamplingError: a token does not fit into the arena at every angle.
-    """
+    """(K,) largest coordinate of each token's centre; SamplingError if the arena is too small."""
     reach: Floats = sim.arena / 2.0 - layout.radii
     if (reach < 0.0).any():
         worst = layout.shapes[int(np.argmin(reach))]
@@ -155,10 +141,3 @@ def check_fits(layout: Layout, sim: SimConfig) -> Floats:
             f"{2.0 * worst.radius:.3g}, or lower tokens.scale"
         )
     return reach
-
-
-def _exhausted(name: str, before: int, sim: SimConfig) -> SamplingError:
-    return SamplingError(
-        f"no room for token '{name}' beside {before} others in {MAX_TRIES} tries in an "
-        f"arena of width {sim.arena:g}: raise sim.arena, or lower tokens.scale"
-    )

@@ -4,7 +4,6 @@ Legend: B environments, K tokens. A layout is poses (B, K, 3) and sides (B, K): 
 their other side.
 """
 
-from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations
 
@@ -24,9 +23,8 @@ from tangram_sim.motion.kinematics import wrap
 from tangram_sim.puzzles.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.connected import MAX_PILE, sample_connected, sample_piles
-from tangram_sim.targets.sampling import sample_batch
+from tangram_sim.targets.sampling import Generators, sample_batch
 
-Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
 _NO_TURN = 1e-6  # radians
 MIN_THICKNESS = 1e-3  # of a token, arenas
@@ -59,12 +57,6 @@ def sample_targets(layout: Layout, sim: SimConfig, generators: Generators) -> Si
 def sample_starts(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
     """One start per generator: on the target's sides, or on any with `allow_flip`.
 
-    Args:
-        layout: the tokens.
-        sim: says whether starts keep clear of the target, or are piles.
-        targets: see `sample_targets`.
-        generators: one for each environment.
-
     Raises:
         SamplingError: no room.
     """
@@ -94,14 +86,7 @@ def _piles(layout: Layout, sim: SimConfig, targets: Sides, generators: Generator
 
 
 def check_targets(layout: Layout, sim: SimConfig) -> None:
-    """Refuse what these tokens cannot play.
-
-    Raises:
-        ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
-            or other sides of tokens that look the same on both, what one token does to others,
-            piles of one token, a token too thin for the arena, or a world in which none could
-            move.
-    """
+    """Raise ConfigError, which names the setting, for what these tokens cannot play."""
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
             "sim.allow_flip=true needs a token that is not its own mirror image, got tokens "
@@ -114,7 +99,11 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         given, usual = f"sim.motion={sim.motion}", SimConfig.motion
         refuse_ignored(given, "one token", "take a set of several", usual)
     _check_thick(layout, sim)
-    _check_delay(layout, sim)
+    if sim.dynamics.delayed and horizon(layout.tokens, sim) == 1:
+        raise ConfigError(
+            "sim.world=delayed moves nothing in an episode of one action: raise "
+            "sim.actions_per_token to at least 2, or set sim.world=plain"
+        )
     if sim.starts == "piles" and layout.tokens == 1:
         refuse_ignored("sim.starts=piles", "one token", "take a set of several")
     if sim.looks:
@@ -131,26 +120,18 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
 def _check_names(layout: Layout, observe: str) -> None:
     """What is found in pictures has no name: tokens of one name must be equal, others unlike."""
     for one, other in combinations(layout.shapes, 2):
-        turn = turn_onto(one.corners, other.corners)
+        turn = _turn_of(one, other)
         if one.name == other.name:
-            if turn is None or abs(turn) > _NO_TURN:
+            if turn is None or turn[1] or abs(turn[0]) > _NO_TURN:
                 raise ConfigError(
                     f"sim.observe={observe} takes tokens of one name for equal, and two of "
                     f"{one.name} have other corners: give them names of their own"
                 )
-        elif turn is not None or turn_onto(mirror_image(one.corners), other.corners) is not None:
+        elif turn is not None:
             raise ConfigError(
                 f"sim.observe={observe} cannot tell {one.name} from {other.name}, which may look "
                 "alike: take equal tokens of one name, or set sim.observe=corners"
             )
-
-
-def _check_delay(layout: Layout, sim: SimConfig) -> None:
-    if sim.dynamics.delayed and horizon(layout.tokens, sim) == 1:
-        raise ConfigError(
-            "sim.world=delayed moves nothing in an episode of one action: raise "
-            "sim.actions_per_token to at least 2, or set sim.world=plain"
-        )
 
 
 def _check_thick(layout: Layout, sim: SimConfig) -> None:
@@ -176,8 +157,9 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
     left = list(range(len(puzzle.pieces)))
     poses, flipped = np.empty((layout.tokens, 3)), np.zeros(layout.tokens, dtype=np.bool_)
     for token, shape in enumerate(layout.shapes):
-        piece = next((k for k in left if _is_piece(puzzle, k, shape)), None)
-        if piece is None:
+        turns = ((k, _turn_of(shape, puzzle.layout.shapes[k])) for k in left)
+        piece, turn = next((one for one in turns if one[1] is not None), (-1, None))
+        if turn is None:
             raise ConfigError(
                 f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)} of scale "
                 f"{puzzle.scale:g}: it cannot be assembled from the tokens "
@@ -185,13 +167,9 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
                 f"tokens.scale={puzzle.scale:g}"
             )
         left.remove(piece)
-        own = puzzle.layout.shapes[piece]
-        turn = turn_onto(shape.corners, own.corners)
-        flipped[token] = turn is None
-        if turn is None:
-            turn = turn_onto(mirror_image(shape.corners), own.corners)
         poses[token] = puzzle.poses[piece]
-        poses[token, 2] += turn or 0.0
+        poses[token, 2] += turn[0]
+        flipped[token] = turn[1]
     if left:
         raise ConfigError(
             f"puzzle '{puzzle.name}' has {len(puzzle.pieces)} pieces, and there are "
@@ -200,12 +178,13 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
     return poses, flipped
 
 
-def _is_piece(puzzle: Puzzle, piece: int, shape: Shape) -> bool:
-    own = puzzle.layout.shapes[piece].corners
-    return any(
-        turn_onto(corners, own) is not None
-        for corners in (shape.corners, mirror_image(shape.corners))
-    )
+def _turn_of(shape: Shape, other: Shape) -> tuple[float, bool] | None:
+    """The angle by which a shape is another one, and whether on its other side, or None."""
+    for flipped, corners in ((False, shape.corners), (True, mirror_image(shape.corners))):
+        turn = turn_onto(corners, other.corners)
+        if turn is not None:
+            return turn, flipped
+    return None
 
 
 def _kind(sim: SimConfig, rng: np.random.Generator) -> str:

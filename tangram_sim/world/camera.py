@@ -17,14 +17,7 @@ class Camera:
     """A camera of one PyBullet client."""
 
     def __init__(self, client: int, pixels: int, arena: float, top: float) -> None:
-        """Point the camera at the arena.
-
-        Args:
-            client: of the engine.
-            pixels: side of its square pictures.
-            arena: width of what it sees, engine units.
-            top: height of what it sees, engine units.
-        """
+        """Point the camera at the arena; its width and the height of what is seen, engine units."""
         self._client = client
         self._pixels = pixels
         # TinyRenderer samples a pixel at its lower left corner, so the camera stands half a pixel

@@ -65,7 +65,8 @@ class PhysicsWorld:
         self._stride = min(_STRIDE, _THIN * thin)
         self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
         self._bodies = [self._make_body(shape) for shape in layout.shapes]
-        self._masses = [self._mass(body) for body in self._bodies]
+        told = [pybullet.getDynamicsInfo(b, -1, physicsClientId=self._client) for b in self._bodies]
+        self._masses = [(one[0], one[2][2]) for one in told]  # and inertia about the vertical
         for token in range(layout.tokens):
             self._weigh(token, 1.0)
         # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
@@ -260,11 +261,6 @@ class PhysicsWorld:
         if self._alone:
             pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
         return body
-
-    def _mass(self, body: int) -> tuple[float, float]:
-        """Mass, and inertia about the vertical."""
-        info = pybullet.getDynamicsInfo(body, -1, physicsClientId=self._client)
-        return info[0], info[2][2]
 
     def _weigh(self, token: int, times: float) -> None:
         """Set the mass and inertia of a token to `times` its own."""

@@ -89,15 +89,7 @@ def check_room(layout: Layout, sim: SimConfig) -> None:
 
 
 def check_shown(sim: SimConfig, outlines: bool) -> None:
-    """Refuse to show silhouettes to who knows nothing of them.
-
-    Args:
-        sim: the world.
-        outlines: whether outlines are known, see `rings`.
-
-    Raises:
-        ConfigError: says who takes them.
-    """
+    """Raise ConfigError, which says who takes silhouettes, for who knows nothing of outlines."""
     if sim.observe == "silhouette" and not outlines:
         raise ConfigError(
             "sim.observe=silhouette is for an agent of outlines: train one with task=fill "
@@ -113,11 +105,7 @@ def check_shown(sim: SimConfig, outlines: bool) -> None:
 
 
 def make_world(layout: Layout, sim: SimConfig) -> World:
-    """A world of the configured backend.
-
-    Raises:
-        ConfigError: the engine is asked for and not installed.
-    """
+    """A world of the configured backend; ConfigError if the engine is not installed."""
     if sim.backend == "kinematic":
         return KinematicWorld(layout, sim)
     try:

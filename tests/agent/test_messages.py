@@ -49,7 +49,6 @@ from tangram_core.wire.schema import (
     Flag,
     Message,
     Numbers,
-    Plain,
     ProtocolError,
     Text,
     Texts,
@@ -229,7 +228,7 @@ plain = st.sampled_from([c for k, c in KINDS.items() if k not in DESCRIBED]).fla
 
 
 @given(plain)
-def test_plain_messages_come_back_as_they_were_sent(message: Plain) -> None:
+def test_plain_messages_come_back_as_they_were_sent(message: Message) -> None:
     assert decode(message.encode(), message.kind) == message
 
 

@@ -21,8 +21,8 @@ from tangram_core.wire.schema import (
     Bound,
     DamagedError,
     Flag,
+    Message,
     Numbers,
-    Plain,
     ProtocolError,
     Text,
     Texts,
@@ -125,7 +125,7 @@ def test_texts_that_may_be_cut_are_cut_to_bytes_of_utf_8(text: str) -> None:
 
 
 @dataclass(frozen=True)
-class Probe(Plain):
+class Probe(Message):
     """A message with one field."""
 
     kind: ClassVar[str] = "probe"

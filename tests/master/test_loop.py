@@ -270,7 +270,7 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
     for _ in range(2):
         made.reporter.scored(scores(MADE, 4).scores)
         made.reporter.flush(0)
-        made.reporter._metrics._try(made.reporter._metrics._writer.flush)
+        made.reporter.metrics._try(made.reporter.metrics._writer.flush)
     with pytest.raises(RunError, match=r"^run_dir .*/run is gone: the run ended without a check"):
         made.finish(launched=False)
     with pytest.raises(RunError, match=r"cannot write .*/test_episodes.png \(No such file or dir"):
@@ -278,7 +278,7 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
     with pytest.raises(RunError, match=r"cannot write .*/result.json \(No such file or directory"):
         made.folder.write_result({})
     made.dismiss("the end")
-    made.reporter._metrics.close()
+    made.reporter.metrics.close()
     assert not folder.exists()
 
 

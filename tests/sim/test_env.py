@@ -232,17 +232,6 @@ def test_compute_reward_is_the_reward_of_the_step(reward: str) -> None:
     np.testing.assert_allclose(together, rewards, atol=1e-12)
 
 
-def test_state_matrix_is_the_papers() -> None:
-    env = kinematic()
-    env.reset(seed=0)
-    state = env.state_matrix()
-    assert state.shape == (9, 13)
-    np.testing.assert_array_equal(state[:4, :2], env.batch.corners[0])
-    np.testing.assert_array_equal(state[:, 3], [0] * 5 + [1] * 4)
-    env.step(np.zeros(3, dtype=np.float32))
-    np.testing.assert_array_equal(env.state_matrix()[:, 3], np.ones(9))
-
-
 def test_render() -> None:
     env = kinematic(render_mode="rgb_array", render_size=100)
     env.reset(seed=0)

@@ -30,8 +30,13 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
         closing(setup.task.make(config.service.envs, "play")) as env,
         joined(config, setup, acting.actor) as client,
     ):
-        if client.stopped or not _take_first_weights(client, acting, report):
+        if client.stopped:
             return 0
+        with report.waiting("no weights yet"):
+            first = client.wait_for_weights()
+        if first is None:
+            return 0
+        acting.follow(first)
         me = client.welcome
         if me.lockstep:
             # Nothing may depend on how often a process was started.
@@ -74,16 +79,6 @@ def _play_in_step(client: Client, acting: Acting, rollout: Rollout, report: Repo
             return
         report.played(episodes.count, acting.version)
         done = order
-
-
-def _take_first_weights(client: Client, acting: Acting, report: Report) -> bool:
-    """Load the first weights; False if the client was stopped before they came."""
-    with report.waiting("no weights yet"):
-        weights = client.wait_for_weights()
-    if weights is None:
-        return False
-    acting.follow(weights)
-    return True
 
 
 def _wait_for_room(client: Client, report: Report) -> bool:

@@ -6,14 +6,20 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import TextIO
 
 import torch
 
 from tangram_core.agent import Actor, Weights
 from tangram_core.errors import TangramError
-from tangram_core.run.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
+from tangram_core.run.process import (
+    WATCHDOG_S,
+    Watchdog,
+    formatter,
+    handling,
+    keep_memory,
+    watch_parent,
+)
 from tangram_core.setup import Setup
 from tangram_core.wire.arrays import check_batch_size
 from tangram_core.wire.messages import TAKEN_OVER
@@ -27,22 +33,13 @@ _log = logging.getLogger(__name__)
 
 
 class Acting:
-    """An actor with the version of its weights.
-
-    Attributes:
-        actor: the agent's.
-        version: of the weights that are loaded; -1 before the first.
-    """
+    """An actor with the version of its weights, -1 before the first."""
 
     def __init__(self, actor: Actor) -> None:
         self.actor, self.version = actor, -1
 
     def follow(self, weights: Weights) -> None:
-        """Take over weights that were broadcast.
-
-        Raises:
-            RunError: they belong to another layout or network.
-        """
+        """Take over weights that were broadcast; RunError if they are of another network."""
         self.actor.load(weights.tensors)
         self.version = weights.version
 
@@ -57,11 +54,6 @@ def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]
 
     On leaving, the master is told, after the batches that are on their way, and the signal handlers
     are put back.
-
-    Args:
-        config: of this worker.
-        setup: the task, which the master must share.
-        actor: what the master's weights must fit.
 
     Raises:
         TangramError: the master refuses, or does not answer.
@@ -85,7 +77,8 @@ def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]
         actor.shapes,
     )
     client.on_progress = watchdog.progress
-    with client, stopped_by_signals(client), watchdog:
+    # They stop the client instead of the process, so that it can say BYE.
+    with client, handling(lambda number: client.stop(number.name), SIGNALS), watchdog:
         if client.join():
             me = client.welcome
             log_as(f"{config.role} {me.index}", service.log_format)
@@ -100,11 +93,7 @@ def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]
 def keep_part(run: Callable[[WorkerConfig, Setup], int], config: WorkerConfig, setup: Setup) -> int:
     """Run a player or an evaluator, and again when another process takes the index it was given.
 
-    Returns:
-        Exit status 0.
-
-    Raises:
-        TangramError: as `run`.
+    Returns its exit status, and raises what it does.
     """
     while True:
         try:
@@ -112,21 +101,6 @@ def keep_part(run: Callable[[WorkerConfig, Setup], int], config: WorkerConfig, s
         except IndexTakenError as error:
             fields = {"event": "index_taken"}
             _log.info("%s: it goes on with an index that is free", error, extra=fields)
-
-
-@contextmanager
-def stopped_by_signals(client: Client) -> Iterator[None]:
-    """The signals stop the client instead of the process, so that it can say BYE."""
-
-    def handle(number: int, _frame: FrameType | None) -> None:
-        client.stop(signal.Signals(number).name)
-
-    before = {number: signal.signal(number, handle) for number in SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def log_as(who: str, log_format: str) -> None:

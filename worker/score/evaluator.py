@@ -9,7 +9,6 @@ from PIL import Image
 
 from tangram_core.agent import Weights
 from tangram_core.arrays import Pixels
-from tangram_core.run.service import ServiceConfig
 from tangram_core.scores import SHOWN, told
 from tangram_core.setup import Setup
 from tangram_core.wire.messages import PICTURE_HEIGHT, PICTURE_WIDTH, Scores
@@ -59,16 +58,10 @@ class Schedule:
 
 
 def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
-    """Score the newest weights until the master or a signal ends it.
-
-    Returns:
-        Exit status 0.
-
-    Raises:
-        TangramError: a setting that cannot work, or a master that refuses or is gone for long.
-    """
-    acting, schedule = Acting(setup.agent.actor(setup.task)), _schedule(config.service)
-    tests = FixedTests(setup.task, config.service.eval_episodes, config.service.envs)
+    """Score the newest weights until the master or a signal ends it; as `run_player`."""
+    acting, service = Acting(setup.agent.actor(setup.task)), config.service
+    schedule = Schedule(service.eval_seconds, max(STILL_S, 4.0 * service.publish_seconds))
+    tests = FixedTests(setup.task, service.eval_episodes, service.envs)
     with closing(tests), joined(config, setup, acting.actor) as client:
         while not client.stopped:
             client.poll(POLL_S)
@@ -81,10 +74,6 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
                     client.send_scores(scores)
                 schedule.scored(time.monotonic())
     return 0
-
-
-def _schedule(service: ServiceConfig) -> Schedule:
-    return Schedule(service.eval_seconds, max(STILL_S, 4.0 * service.publish_seconds))
 
 
 def _evaluate(tests: FixedTests, acting: Acting, client: Client) -> Scores | None:

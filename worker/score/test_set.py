@@ -8,7 +8,10 @@ from worker.play.rollout import play
 
 
 class FixedTests:
-    """Test episodes that are the same whoever plays them.
+    """Test episodes that are the same whoever plays them, `at_once` of them at a time.
+
+    The first ones of a larger set are those of a smaller one. `role` and `seed` name the set; by
+    default it is that of `seeding.evaluation_generators`.
 
     Attributes:
         task: what is played.
@@ -18,14 +21,6 @@ class FixedTests:
     def __init__(
         self, task: Task, episodes: int, at_once: int, role: str = "evaluation", seed: int = 0
     ) -> None:
-        """Open the environments.
-
-        Args:
-            task: what is played.
-            episodes: size of the set; the first ones of a larger set are those of a smaller one.
-            at_once: most episodes played at a time.
-            role, seed: name the set; the defaults name `seeding.evaluation_generators`.
-        """
         self.task, self._episodes = task, episodes
         self._set = (seed, role, 0, 0)
         self.env = task.make(min(at_once, episodes), "test")

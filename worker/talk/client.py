@@ -42,7 +42,7 @@ from tangram_core.wire.messages import (
     Welcome,
     decode_from_master,
 )
-from tangram_core.wire.schema import Plain, ProtocolError
+from tangram_core.wire.schema import Message, ProtocolError
 from worker.talk.connection import Connection, Sockets, Timing
 from worker.talk.outbox import NewestWeights, Outbox
 
@@ -71,8 +71,6 @@ class Client:
     Attributes:
         stats: numbers that the next heartbeats tell the master, to be set.
         counters: what was sent again, refused, lost or not understood.
-        outbox: batches that the master has not acknowledged.
-        newest: the newest weights.
         joined: the present connection is known to the master.
         on_progress: called whenever the client is at work.
     """
@@ -115,11 +113,7 @@ class Client:
 
     @property
     def welcome(self) -> Welcome:
-        """The master's last WELCOME: seed, run_id, index, incarnation.
-
-        Raises:
-            TangramError: before `join`.
-        """
+        """The master's last WELCOME: seed, run_id, index, incarnation; only after `join`."""
         if self._welcome is None:
             raise TangramError("the client has not joined a master yet: call join() first")
         return self._welcome
@@ -207,11 +201,7 @@ class Client:
         return self._wait(lambda: self.outbox.free > 0, "the master to take what was played")
 
     def send_scores(self, scores: Scores) -> None:
-        """Send the results of an evaluation, once; they are lost if no master is there.
-
-        Raises:
-            WireError: content that the master would refuse.
-        """
+        """Send the results of an evaluation, once; they are lost if no master is there."""
         if not self._post(scores.encode(self._spec)):
             self.counters["lost_scores"] += 1
 
@@ -297,7 +287,7 @@ class Client:
         self._hello_at = now + self._timing.retry_s
         self._ask(sockets, hello, now)
 
-    def _ask(self, sockets: Sockets, question: Plain, now: float) -> None:
+    def _ask(self, sockets: Sockets, question: Message, now: float) -> None:
         self._connection.asked(now)
         sockets.send(question.encode())
 

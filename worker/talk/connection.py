@@ -298,12 +298,7 @@ class Connection:
         self.keys_refused, self._reopen_at = True, now + self._timing.retry_s
 
     def is_dead(self, now: float, joined_before: bool) -> bool:
-        """Whether to try another connection.
-
-        Args:
-            now: monotonic time.
-            joined_before: a master has answered, and its silence is news.
-        """
+        """Whether to try another connection; silence is news where a master has answered before."""
         silent = self._asked_at is not None and now - self._asked_at > self._timing.silence_s
         if silent and joined_before and self._lost_at is None and not self.keys_refused:
             log.warning(

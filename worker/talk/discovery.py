@@ -12,7 +12,7 @@ from typing import Any
 
 from zmq.utils import z85
 
-from tangram_core.errors import RunError
+from tangram_core.errors import UNREADABLE, RunError
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.store.files import check_own
 from tangram_core.wire.addresses import IPC, dns_error
@@ -70,9 +70,7 @@ def as_address(connect: str) -> str | None:
 def find_master(connect: str) -> MasterAddress | None:
     """The master's address; None while its file, or the folder of its sockets, is not there.
 
-    Args:
-        connect: host:port with or without tcp://, a connection file, or a run folder that holds
-            one.
+    `connect` is host:port with or without tcp://, a connection file, or a run folder with one.
 
     Raises:
         RunError: neither an address nor a readable connection file.
@@ -97,14 +95,7 @@ def find_master(connect: str) -> MasterAddress | None:
         return MasterAddress(*known, content.get("settings"))
     except FileNotFoundError:
         return None
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ) as error:
+    except UNREADABLE as error:
         raise RunError(
             f"{path} is no connection file ({_why(error)}): connect=... takes host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
@@ -114,12 +105,7 @@ def find_master(connect: str) -> MasterAddress | None:
 def await_master(
     connect: str, tell: Callable[[str], None], patience_s: float = PATIENCE_S
 ) -> MasterAddress:
-    """The master's address, also when its file is written later.
-
-    Args:
-        connect: see `find_master`.
-        tell: takes a line for the user.
-        patience_s: most to wait.
+    """The master's address, also when its file is written later; `tell` takes a line for the user.
 
     Raises:
         RunError: neither an address nor a readable connection file, or none in time.

@@ -49,9 +49,7 @@ class Outbox:
 class NewestWeights:
     """The newest weights of the master's present life, whichever way they came, until taken.
 
-    Attributes:
-        epoch: of that life; weights of another are dropped.
-        version: newest that came, -1 before the first.
+    Weights of another epoch are dropped; before the first the version is -1.
     """
 
     def __init__(self, shapes: WeightShapes | None) -> None:
@@ -71,11 +69,7 @@ class NewestWeights:
             self.epoch, self.version, self._fresh = epoch, -1, None
 
     def offer_frame(self, frame: bytes) -> None:
-        """Decode a broadcast and keep it if it is newer.
-
-        Raises:
-            WireError: malformed, or weights of another network.
-        """
+        """Decode a broadcast and keep it if it is newer; WireError as in `decode_weights`."""
         self.offer(*decode_weights(frame, self._shapes))
 
     def offer(self, epoch: str, weights: Weights) -> None:

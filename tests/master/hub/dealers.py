@@ -12,7 +12,7 @@ from master.hub.hub import Hub
 from master.record.delivery import Arrival, EpisodesArrived
 from tangram_core.wire.arrays import WeightShapes
 from tangram_core.wire.messages import Heartbeat, Reject, ToWorker, Welcome, decode_from_master
-from tangram_core.wire.schema import Plain
+from tangram_core.wire.schema import Message
 from tests.agent.messages import FINGERPRINTS, SPEC, TASK, batch, hello
 
 LIMIT_S = 100.0
@@ -86,7 +86,7 @@ class Dealer:
         self.stage, self.socket = stage, socket
         socket.connect(stage.hub.endpoint)
 
-    def say(self, message: Plain | list[bytes]) -> None:
+    def say(self, message: Message | list[bytes]) -> None:
         self.socket.send_multipart(message if isinstance(message, list) else message.encode())
 
     def send(self, *sequences: int) -> None:
@@ -99,7 +99,7 @@ class Dealer:
         self.stage.until(lambda: self.socket.poll(0))
         return decode_from_master(self.socket.recv_multipart(), shapes)
 
-    def ask(self, message: Plain | list[bytes]) -> ToWorker:
+    def ask(self, message: Message | list[bytes]) -> ToWorker:
         """Say something, and hear the next answer."""
         self.say(message)
         return self.hear()

@@ -38,7 +38,7 @@ def test_what_is_told(tmp_path: Path) -> None:
     }
     assert expected.items() <= dict(last.numbers).items()
     assert last.texts["activity"] == "waiting for episodes"
-    made.reporter._metrics.close()
+    made.reporter.metrics.close()
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     expected_tags = {

@@ -45,27 +45,6 @@ def test_edges_of_two_tokens() -> None:
     assert set(zip(*map(list, np.nonzero(layout.adjacency)), strict=True)) == edges
 
 
-def test_state_matrix_of_the_square() -> None:
-    layout = layout_of("square")
-    corners = layout.corners(np.array([[0.1, 0.2, 0.0]]))
-    goal = layout.corners(np.array([[-0.5, 0.3, math.pi / 2]]))
-    state = layout.state_matrix(corners, np.array([False]), goal)
-    assert state.shape == (9, 4 + 9)
-    expected = [  # x, y, part of the target, placed
-        [-0.1, 0.0, 0, 0],
-        [0.3, 0.0, 0, 0],
-        [0.3, 0.4, 0, 0],
-        [-0.1, 0.4, 0, 0],
-        [0.1, 0.2, 0, 0],
-        [-0.3, 0.1, 1, 1],
-        [-0.3, 0.5, 1, 1],
-        [-0.7, 0.5, 1, 1],
-        [-0.7, 0.1, 1, 1],
-    ]
-    np.testing.assert_allclose(state[:, :4], expected, atol=1e-12)
-    np.testing.assert_array_equal(state[:, 4:], layout.adjacency)
-
-
 coordinate = st.floats(-10.0, 10.0)
 pose = st.tuples(coordinate, coordinate, st.floats(-math.pi, math.pi), st.booleans())
 

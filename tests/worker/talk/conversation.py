@@ -28,14 +28,14 @@ from tangram_core.wire.messages import (
     Welcome,
     decode_from_worker,
 )
-from tangram_core.wire.schema import Plain
+from tangram_core.wire.schema import Message
 from tests.agent.builders import with_bound
 from tests.agent.messages import FINGERPRINTS, SPEC
 from tests.master.hub.dealers import Stage
 from worker.talk.client import Client
 from worker.talk.connection import Timing
 
-Message = TypeVar("Message")
+Kind = TypeVar("Kind")
 Result = TypeVar("Result")
 
 LIMIT_S = 100.0
@@ -132,7 +132,7 @@ class StandIn:
             if time.monotonic() > deadline:
                 raise TimeoutError("no heartbeat came")
 
-    def say(self, *messages: Plain | list[bytes]) -> None:
+    def say(self, *messages: Message | list[bytes]) -> None:
         """Answer the connection that was heard last."""
         for message in messages:
             frames = message if isinstance(message, list) else message.encode()
@@ -157,11 +157,11 @@ class StandIn:
         self.say(self.welcome_message(**changes))
         self.await_kind(client, WantWeights)
 
-    def await_kind(self, client: Client, kind: type[Message]) -> Message:
+    def await_kind(self, client: Client, kind: type[Kind]) -> Kind:
         """The next message of this kind."""
         count = len(self.heard)
 
-        def found() -> list[Message]:
+        def found() -> list[Kind]:
             return [m for m in self.heard[count:] if isinstance(m, kind)]
 
         self.until(client, found)
