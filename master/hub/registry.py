@@ -204,7 +204,7 @@ class Registry:
         }
 
     def load_state(self, state: Mapping[str, Mapping[str, int | str]], now: float) -> None:
-        """Take a checkpoint's ledgers, whose indices wait for their workers; or RunError."""
+        """Take a checkpoint's ledgers, whose indices wait for workers; RunError if malformed."""
         self._ledgers = {_key(name): _ledger(name, entry) for name, entry in state.items()}
         self._reserved_until = now + self._grace_s
 

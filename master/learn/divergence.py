@@ -72,7 +72,7 @@ class DivergenceGuard:
         return weights
 
     def check(self) -> None:
-        """Keep the state if it is finite, else go back to the one before; or RunError."""
+        """Keep the state if it is finite, else the one before; RunError where there is none."""
         state = self.trainer.learner.state()
         try:
             _check_finite(state, self.trainer.updates)

@@ -75,6 +75,7 @@ class NetworkLearner(Learner):
         parts: all networks, by the names under which a checkpoint has them.
         lists: their parameters. Walking modules would take a fifth of a small network's update.
         optimisers: of the networks that learn, by their names in `parts`.
+        names: of the numbers of an update in which the actor moves, and of one in which it rests.
     """
 
     compiles = True
@@ -103,7 +104,7 @@ class NetworkLearner(Learner):
         """
         for name in targets:
             if name not in learned:
-                self._refuse("target_names", f"'{name}'", f"names of {', '.join(learned)}")
+                self.refuse("target_names", f"'{name}'", f"names of {', '.join(learned)}")
         self.targets = {name: frozen(learned[name]) for name in targets}
         following = {f"target_{name}": module for name, module in self.targets.items()}
         self.parts: dict[str, nn.Module] = {**learned, **following, **(others or {})}
@@ -115,7 +116,7 @@ class NetworkLearner(Learner):
             n: [*one.parameters()] for n, one in self.parts.items()
         }
         self.optimisers: dict[str, Optimiser] = {name: Adam(self.lists[name]) for name in learned}
-        self._names: dict[bool, tuple[str, ...]] = {}
+        self.names: dict[bool, tuple[str, ...]] = {}
         self._whole: Callable[[Any, Rates], Tensor] = self.step
         if compiled:
             slots = [own for each in self.optimisers.values() for own in each.slots.values()]
@@ -169,23 +170,16 @@ class NetworkLearner(Learner):
         """
         found = self._whole(seen, self.rates(share))  # the one wait for the device is below
         values = [found, *(one[None] for one in (told or {}).values())]
-        names = *self._names[getattr(seen, "acts", True)], *(told or {})
+        names = *self.names[getattr(seen, "acts", True)], *(told or {})
         numbers = dict(zip(names, torch.cat(values).tolist(), strict=True))
         if not all(map(math.isfinite, numbers.values())):
             listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
             raise NotFiniteError(f"update {self.updates + 1} is not finite ({listed})")
         self.updates += 1
-        if self.updates == self.delay:  # each form of an update was made once
-            named = {name for names in self._names.values() for name in names}
-            for name in self.optimisers:
-                if f"{name}_loss" not in named:
-                    self._refuse(
-                        "losses", f"none of '{name}'", "a Loss of each network that learns"
-                    )
         return numbers
 
     def step(self, seen: Any, rates: Rates) -> Tensor:
-        """The whole update, on the device alone; its numbers, by the names in `_names`."""
+        """The whole update, on the device alone; its numbers, by their names in `names`."""
         numbers: dict[str, Tensor] = {}
         for loss in self.losses(seen):
             self._check(loss)
@@ -196,19 +190,20 @@ class NetworkLearner(Learner):
             own = {f"{loss.part}_loss": loss.value, f"{loss.part}_gradient": norm}
             numbers |= own | dict(loss.told)
         self.follow(rates)
-        self._names[getattr(seen, "acts", True)] = tuple(numbers)
+        self.names[getattr(seen, "acts", True)] = tuple(numbers)
         return torch.stack([one.detach() for one in numbers.values()])
 
     def _check(self, loss: Loss) -> None:
         """Refuse a loss of no network, or what is no single number."""
         if loss.part not in self.optimisers:
             known = ", ".join(self.optimisers)
-            self._refuse("losses", f"a Loss of '{loss.part}'", f"one of {known}")
+            self.refuse("losses", f"a Loss of '{loss.part}'", f"one of {known}")
         for name, value in {f"a Loss of '{loss.part}'": loss.value, **loss.told}.items():
             if value.ndim:
-                self._refuse("losses", f"{name} of shape {tuple(value.shape)}", "a single number")
+                self.refuse("losses", f"{name} of shape {tuple(value.shape)}", "a single number")
 
-    def _refuse(self, method: str, came: str, wanted: str) -> NoReturn:
+    def refuse(self, method: str, came: str, wanted: str) -> NoReturn:
+        """Tell who wrote the learner what a method of it must not give."""
         raise ConfigError(f"{type(self).__name__}.{method}: wanted {wanted}, got {came}")
 
     def prepare(self) -> None:

@@ -6,7 +6,7 @@ Legend: B transitions, F entries of a row, A entries of an action, N draws.
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -133,6 +133,18 @@ class ActorCritic(NetworkLearner, Generic[Config]):
     def rates(self, share: float) -> Rates:  # noqa: ARG002
         """The same for all networks, and to the end."""
         return Rates(self.config.learning_rate, self.config.learning_rate, 0.0)
+
+    def learn(
+        self, seen: Any, share: float = 0.0, told: Mapping[str, Tensor] | None = None
+    ) -> dict[str, float]:
+        """See `NetworkLearner.learn`; refuse losses that leave a network out."""
+        numbers = super().learn(seen, share, told)
+        if len(self.names) == min(self.delay, 2):  # each form of an update was made
+            found = {name for names in self.names.values() for name in names}
+            for name in self.optimisers:
+                if f"{name}_loss" not in found:
+                    self.refuse("losses", f"none of '{name}'", "a Loss of each network that learns")
+        return numbers
 
     def drawn(self, rng: Streams) -> Batch:
         """What the next update learns from: all that is random in it is drawn here."""

@@ -41,7 +41,11 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True)
 
 
 def make_folders(folder: Path, above: bool = True) -> None:
-    """Make a folder, and with `above` those above it, with its name on the disk; or OSError."""
+    """Make a folder, and with `above` those above it, with its name on the disk.
+
+    Raises:
+        OSError: that fails.
+    """
     try:
         folder.mkdir(exist_ok=True)
     except FileNotFoundError:
@@ -78,7 +82,11 @@ def check_writable(name: str, path: Path) -> None:
 
 
 def own_folder(path: Path) -> None:
-    """Make a folder that only this user may enter, or see that one is there; or RunError."""
+    """Make a folder that only this user may enter, or see that one is there.
+
+    Raises:
+        RunError: it can be neither.
+    """
     try:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
@@ -112,7 +120,7 @@ def _aside(path: Path) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until a folder's names are on the disk: a power cut would undo a rename; or OSError."""
+    """Wait until a folder's names are on the disk: a power cut would undo a rename."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

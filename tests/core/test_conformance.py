@@ -125,11 +125,11 @@ class Broken(POINT.Point):  # type: ignore[misc,name-defined]
         ("pays otherwise", "Broken.rewards: wanted what the step was paid"),
         ("flags of numbers", "Points.step: wanted terminated"),
         ("goal moves", "Points.step: wanted field goal to stay"),
-        ("whole numbers", "Points.reset: wanted place to be f4 (3, 2), got <i4"),
+        ("whole numbers", "Points.reset: wanted place to be float32 (3, 2), got int32"),
         ("out of bounds", "Points.reset: wanted place within -1 and 1"),
         ("not a number", "Points.reset: wanted place within -1 and 1, got nan"),
         ("a field more", "Points.reset: wanted fields ['goal', 'place'], got ['goal', 'place'"),
-        ("a row less", "Points.reset: wanted place to be f4 (3, 2)"),
+        ("a row less", "Points.reset: wanted place to be float32 (3, 2)"),
     ],
 )
 def test_a_task_that_breaks_a_promise_is_told(fault: str, told: str) -> None:
@@ -178,7 +178,7 @@ full = TD3.TD3Learner.broadcast
         ({"update": lambda self, share, rng: {"q": np.nan}}, ".update: wanted finite"),
         ({"update": lambda self, share, rng: {"q": 1.0}}, ".update: wanted updates to be 1"),
         ({"load_state": lambda self, state: None}, ".load_state: wanted the numbers of one"),
-        ({"begin_with": lambda self, state: None}, ".load_state: wanted the numbers of one"),
+        ({"load_networks": lambda self, state: None}, ".load_state: wanted the numbers of one"),
         ({"insert": lambda self, episodes, rng: 0}, ".insert: wanted 1 to"),
     ],
 )
