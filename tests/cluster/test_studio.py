@@ -81,7 +81,9 @@ def test_the_page_is_small_and_of_no_other_host(running: Running) -> None:
         size += len(body)
     assert size <= 300_000
     assert running.get("/")[2] == (STATIC / "index.html").read_bytes()
-    status, _, body = running.get("/api/figures")
+    while (answer := running.get("/api/figures"))[0] == 503:  # a busy machine takes its time
+        pass
+    status, _, body = answer
     content = json.loads(body)
     assert (status, len(content["tokens"]), len(content["figures"])) == (200, 7, 49)
     for path in ("/../pyproject.toml", "/%2e%2e/config.py", "/static", "/x.js"):

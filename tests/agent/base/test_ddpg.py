@@ -228,7 +228,7 @@ def test_the_penalty_counts_by_its_weight() -> None:
             learner.critic.head.readout.weight.zero_()
         steps = learner.steps(random_transitions(made, 16), np.random.default_rng(0))
         numbers = learner.step(steps, Rates(0.0, 0.0, 0.0)).tolist()
-        norms.append(numbers[learner._names[True].index("actor_gradient")])
+        norms.append(numbers[learner.names[True].index("actor_gradient")])
     assert norms[1] == pytest.approx(2.0 * norms[0], rel=1e-5)
     assert norms[0] > 0.0
 
