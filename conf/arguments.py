@@ -64,6 +64,10 @@ def options_first(arguments: Sequence[str], config_name: str) -> list[str]:
             overrides.append(argument)
     if options[-1:] == ["--cfg"]:
         options.append("job")
+    if "--cfg" in options and any(one.startswith("from_config=") for one in overrides):
+        raise ConfigError(
+            "--cfg shows presets and arguments alone: leave from_config out, or read it"
+        )
     for override in overrides:
         _check_override(override, COMMANDS[config_name].over)
     if len(set(FLAGS) & set(options)) > 1:

@@ -26,7 +26,7 @@ from conf.commands import COMMANDS, GROUPS, Plain
 from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of
 from conf.names import hidden, revealed
-from conf.own import with_named_code
+from conf.own import with_named_code, without_named_code
 from conf.sweep import LAUNCHER, check_launcher, refuse_lost_job
 from tangram_core.errors import ConfigError, TangramError
 from tangram_core.registry import TASK
@@ -67,8 +67,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
     gc.disable()  # composing makes much and drops nothing: collecting was a fifth of its time
     try:
         folder, arguments = without_own_presets(arguments)
-        composes = TASK in COMMANDS[config_name].groups
-        arguments = with_named_code(arguments, composes=composes)
+        arguments = with_named_code(arguments)
         if {"-h", "--help"} & set(arguments):
             kinds = kinds_of(arguments, folder)
             sections = COMMANDS[config_name].sections(kinds)
@@ -79,11 +78,13 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
                 else help_text(config_name, folder, kinds)
             )
             return 0
+        kinds = kinds_of(arguments, folder, _stored_kinds(arguments))
+        if TASK not in COMMANDS[config_name].groups:
+            arguments = without_named_code(arguments)
         options = [] if folder is None else [OWN_PRESETS[0], folder]
         _check_presets(folder)
         sys.argv[1:] = [*options, *hidden(options_first(arguments, config_name), config_name)]
         check_launcher(sys.argv[1:])
-        kinds = kinds_of(arguments, folder, _stored_kinds(arguments))
         return _run(config_name, task, stored, kinds)
     except TangramError as error:
         # What a user gave may hold line breaks and the terminal's control characters.
@@ -250,7 +251,7 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
     overrides = list(HydraConfig.get().overrides.task)
     if _is_elsewhere():  # a process of its own, which has loaded nothing
-        with_named_code(overrides, composes=True)
+        with_named_code(overrides)
     return with_named_reward(with_run_config(plain, overrides, stored), overrides)
 
 

@@ -30,7 +30,7 @@ RUN: dict[str, str | list[str]] = {
     "service": "local",
     "tokens": "square",
 }
-OVER = ("sim", "reward", "agent")
+OVER = ("task", "sim", "reward", "agent")
 NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
 
 
@@ -96,7 +96,7 @@ class Command:
         }
         for group, section in given.items():
             section |= {own.name: plain_default(own) for own in declared(known[group])}
-        over = {group: dict.fromkeys(laid_over(group)) for group in self.over}
+        over = {group: dict.fromkeys(laid_over(group, kinds)) for group in self.over}
         return given | over
 
     def node(self, kinds: Kinds = USUAL) -> Plain:
@@ -115,9 +115,14 @@ def declared(section: type[Settings] | None) -> list["Field[Any]"]:
     return [] if section is None else declared_fields(section)
 
 
-def laid_over(group: str) -> dict[str, "Field[Any]"]:
-    """The settings that may be laid over a run's, of whatever kind it is, by their names."""
-    every = [kinds.sections()[group] for kinds in every_kind(group)]
+def laid_over(group: str, own: Kinds = USUAL) -> dict[str, "Field[Any]"]:
+    """The settings that may be laid over a run's, of whatever kind it is, by their names.
+
+    Args:
+        group: of settings.
+        own: a task and an agent that do not come with the package.
+    """
+    every = [kinds.sections().get(group) for kinds in (*every_kind(group), own)]
     return {own.name: own for section in every for own in declared(section)}
 
 

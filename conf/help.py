@@ -116,6 +116,7 @@ def _groups_text(command: Command, folder: str | None, kinds: Kinds) -> Iterator
     yield "Config groups (* is the default):"
     for group, default in group_defaults(command, kinds).items():
         names = [f"{n}*" if n in default else n for n in choices(group, folder)]
+        names += ["or path/to/file.py:Name"] if group in kinds.named() else []
         yield from wrap(
             f"{group:<8} {', '.join(names)}", WIDTH, initial_indent="  ", subsequent_indent=" " * 11
         )
@@ -128,7 +129,7 @@ def _over_text(command: Command) -> Iterator[str]:
     if not command.over:
         return
     yield ""
-    sections = " and ".join(command.over)
+    sections = ", ".join(command.over)
     yield f"Besides, settings of {sections} in place of what the run was trained with, as in"
     yield "sim.corner_noise=0.01 agent.reapply=1. What was for learning only, or is built into the"
     yield "weights, is refused."

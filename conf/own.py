@@ -14,34 +14,36 @@ from tangram_core.run.code import MODULES, name_modules, own_code, unquoted
 ROLES: tuple[Role, ...] = ("task", "agent")
 
 
-def with_named_code(arguments: Sequence[str], *, composes: bool) -> list[str]:
+def with_named_code(arguments: Sequence[str]) -> list[str]:
     """Load the code that arguments name, and write them as hydra takes them.
-
-    Args:
-        arguments: of a command.
-        composes: whether it makes a task and an agent of them. What plays a trained run has them
-            already, and only learns which of their code is trusted.
 
     Raises:
         ConfigError: code that cannot be loaded.
     """
-    given = [_named(argument) for argument in arguments]
-    return [argument for argument, is_code in given if composes or not is_code]
+    return [_named(argument) for argument in arguments]
 
 
-def _named(argument: str) -> tuple[str, bool]:
-    """An argument for hydra, and whether it is code."""
+def without_named_code(arguments: Sequence[str]) -> list[str]:
+    """For a command that plays trained runs, which have a task and an agent already."""
+    names = (MODULES, *(f"{role}.{KIND}" for role in ROLES))
+    return [one for one in arguments if one.lstrip("+").partition("=")[0] not in names]
+
+
+def _named(argument: str) -> str:
     name, _, value = argument.lstrip("+").partition("=")
     plain = unquoted(value)
     if name == MODULES:
         name_modules(plain)
-        return argument, True
     for role in ROLES:
         if name in (role, f"{role}.{KIND}") and own_code(plain) is not None:
             if "," in plain:
                 raise ConfigError(f"{argument}: one file at a time: give a sweep for each")
             load_own(role, plain)
-            return f"{role}.{KIND}={value}", True
+            return f"{role}.{KIND}={value}"
         if name == role and plain not in choices(role) and plain in announced(role):
-            return f"{role}.{KIND}={value}", False
-    return argument, False
+            return f"{role}.{KIND}={value}"
+        if name == role and ".py" in plain:
+            raise ConfigError(
+                f"{argument}: name the class in it, as in {role}=path/to/file.py:Name"
+            )
+    return argument

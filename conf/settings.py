@@ -72,7 +72,7 @@ def _laid_over(command: Command) -> Iterator[str]:
         names = ", ".join(f"`{name}`" for group in command.over for name in playable(group))
         yield (
             "In place of what the run was trained with, as in `sim.corner_noise=0.01`: "
-            f"{names}. The others of {' and '.join(command.over)} are refused."
+            f"{names}. The others of {', '.join(command.over)} are refused."
         )
 
 

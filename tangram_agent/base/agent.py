@@ -58,6 +58,7 @@ def seen_tokens(task: Task, kind: str) -> Place:
     """
     if not isinstance(task, Place) or task.outlines:
         raise ConfigError(
-            f"agent.kind={kind} plays tokens whose target it sees: set task=place, or another agent"
+            f"agent.kind={kind} plays tokens whose target it sees: set task=place, or another "
+            "agent, as agent=goal for fields that are numbers"
         )
     return task

@@ -34,8 +34,8 @@ class Inputs:
         for field in spec.fields:
             if field.dtype != "f4":
                 raise ConfigError(
-                    f"this agent sees numbers, and the task's field {field.name} is {field.dtype}: "
-                    "choose an agent for such fields, or let the task give it as f4"
+                    f"this agent sees numbers, and the field {field.name} of this task is "
+                    f"{field.dtype}: name a task of numbers (task=...), or an agent for such fields"
                 )
 
     def rows(self, seen: Arrays) -> Singles:

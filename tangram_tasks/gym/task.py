@@ -12,7 +12,7 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
 from tangram_core.scores import Score
-from tangram_core.settings import Settings, setting
+from tangram_core.settings import NETWORK, Settings, setting
 from tangram_core.spec import Array, EpisodeSpec
 from tangram_core.task import Env, Json, Played, Purpose, Task
 
@@ -26,9 +26,11 @@ SUCCESS = "is_success"  # in gymnasium's info, and in the facts of a moment
 class GymConfig(Settings, section="task"):
     """Which environment of gymnasium is played."""
 
-    id: str = setting("", "the environment's id at gymnasium, such as FetchReach-v4")
+    id: str = setting("", "the environment's id at gymnasium, such as FetchReach-v4", part=NETWORK)
     imports: tuple[str, ...] = setting(
-        (), "modules to import first, which register environments: gymnasium_robotics, panda_gym"
+        (),
+        "modules to import first, which register environments: gymnasium_robotics, panda_gym",
+        part=NETWORK,
     )
     ends: bool = setting(
         True,

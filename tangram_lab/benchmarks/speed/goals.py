@@ -91,7 +91,7 @@ def _ours(id: str, minutes: float, folder: Path, cores: list[int]) -> Curve:  # 
         *("task=gym", f"task.id={id}", f"task.imports=[{module_of(id)}]", "agent=goal"),
         *(f"workers={max(2, len(cores) - 1)}", "service.envs=2", "service.device=cpu"),
         *(f"service.eval_seconds={LOOK_S}", f"service.eval_episodes={TESTS}"),
-        f"max_hours={minutes / 60.0}",
+        *(f"max_hours={minutes / 60.0}", "max_updates=0"),
     )
     every = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)  # children inherit it
