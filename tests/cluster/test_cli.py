@@ -124,6 +124,7 @@ WRONG = [
         "service.mode=lockstep",
         "plays an episode otherwise after another one: set task.fresh=true",
     ),
+    ("tangram-master run_dir=/proc/tangram", "run_dir /proc/tangram cannot be made"),
     ("tangram-worker", "say which run: connect=runs/..., or a"),
     ("tangram-worker connect=tcp://127.0.0.1:99999", "port from 1 to 65535"),
     ("tangram-status connect=tcp://127.0.0.1:65536", "port from 1 to 65535"),
