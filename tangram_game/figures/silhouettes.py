@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
-from PIL.PngImagePlugin import PngInfo
 
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError, RunError
@@ -31,7 +30,6 @@ if TYPE_CHECKING:  # they need OpenCV and shapely
     from tangram_vision.given.silhouette_files import Silhouette
 
 SECONDS = 5.0  # of the search
-MARK = "tangram-play: a silhouette that was not filled"  # within pictures of these
 RED = (220, 38, 38)
 _TILE = 480  # pixels of a picture that is alone
 _EDGE = 3  # pixels: what differs less widely is the roughness of edges
@@ -180,26 +178,12 @@ def _reddened(
 
 
 def _kept(picture: Image.Image, out: Path) -> str:
-    """Write an attempt, and say where; no other picture is written over."""
-    path = out.with_suffix(".png")
-    if path != out and path.exists() and not _is_ours(path):
-        return f"the best attempt is not drawn, as {path} is something else: give out=NAME.png"
-    marked, data = PngInfo(), BytesIO()
-    marked.add_text("Comment", MARK)
-    picture.save(data, format="PNG", pnginfo=marked)
+    """Write an attempt, beside a film that there will not be, and say where."""
+    path = out if out.suffix == ".png" else out.with_suffix(".attempt.png")
+    data = BytesIO()
+    picture.save(data, format="PNG")
     try:
         write_whole(path, data.getvalue())
     except RunError as error:
         return f"the best attempt is not drawn: {error}"
     return f"the best attempt is drawn in {path}"
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether a path leads to the picture of an attempt of before."""
-    if not path.is_file():
-        return False
-    try:
-        with Image.open(path, formats=("PNG",)) as picture:
-            return bool(picture.info.get("Comment") == MARK)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return False
