@@ -115,6 +115,10 @@ def _check_presets(folder: str | None) -> None:
 
     from tangram_core.store.stored import check_extent
 
+    if Path(folder, "hydra").exists():
+        raise ConfigError(
+            f"{OWN_PRESETS[0]}: {folder}/hydra sets hydra's own settings: take it away"
+        )
     for path in (path for group in GROUPS for path in Path(folder, group).rglob("*.yaml")):
         try:
             check_extent(path.read_text(encoding="utf-8"), f"preset {path}")
@@ -130,6 +134,11 @@ def _check_presets(folder: str | None) -> None:
             raise ConfigError(f"preset {path} cannot be read ({why}): mend it") from None
         if not (content and isinstance(content, dict)):
             raise ConfigError(f"preset {path} sets nothing: write settings as in name: value")
+        # Hydra's own settings may name functions that are called.
+        if "hydra" in str(content) or "@package" in path.read_text(encoding="utf-8"):
+            raise ConfigError(
+                f"preset {path} sets more than its group: leave hydra and @package out"
+            )
 
 
 def _run(

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from conf.cli import entry, tell
 from conf.commands import Plain
 from tangram_core.errors import ConfigError, TangramError
-from tangram_core.registry import AGENT, KIND, SHA256, TASK
-from tangram_core.run.code import where
+from tangram_core.registry import AGENT, SHA256, TASK
+from tangram_core.run.code import code_of, where
 from tangram_core.run.process import VARIABLE
 
 if TYPE_CHECKING:
@@ -74,6 +74,19 @@ def _master(settings: Plain) -> int:
 
 
 def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
+    """See `_made`; what goes wrong in code of the user's own is one line."""
+    try:
+        return _made(settings, plays=plays)
+    except TangramError:
+        raise
+    except Exception as error:
+        own = ", ".join(f"{name}={value}" for name, value in code_of(settings).items())
+        if not own:
+            raise
+        raise ConfigError(f"{own} failed: {where(error)}: mend it") from error
+
+
+def _made(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
     """What is to be trained; code of the user's own is written into the settings by its content.
 
     Raises:
@@ -114,16 +127,10 @@ def _hold_own_code(setup: "Setup") -> None:
     from tangram_core.conformance import check_agent, check_task
 
     tell(f"plays and learns a little with {' and '.join(own)} of your own")
-    try:
-        if TASK in own:
-            check_task(setup.task)
-        if AGENT in own:
-            check_agent(setup.agent, setup.task)
-    except TangramError:
-        raise
-    except Exception as error:  # it is the user's code: anything may go wrong
-        named = ", ".join(f"{role}={setup.kinds[role][KIND]}" for role in own)
-        raise ConfigError(f"{named} failed: {where(error)}: mend it") from error
+    if TASK in own:
+        check_task(setup.task)
+    if AGENT in own:
+        check_agent(setup.agent, setup.task)
 
 
 def _make_absolute(settings: Plain) -> None:

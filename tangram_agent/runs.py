@@ -18,7 +18,7 @@ from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_core.agent import Actor, Weights
 from tangram_core.arrays import Floats, Singles
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.registry import KIND
+from tangram_core.registry import KIND, SHA256
 from tangram_core.settings import (
     KEY,
     LEARNING,
@@ -324,6 +324,8 @@ def _trained(folder: Path, checkpoint: str | None, reward: str | None) -> Run:
     known = content.counters.get(SETUP, {})
     odd = [name for name in setup.differences(known) if name in POLICY_SECTIONS]
     odd += setup.meant_otherwise(known, "sim")
+    own = setup.contents()
+    odd += [r for r in ("task", "agent") if own[r].get(SHA256) != known.get(r, {}).get(SHA256)]
     if odd:
         raise RunError(
             f"{folder / CONFIG} is not what {path.name} was trained with: its {', '.join(odd)} "

@@ -5,12 +5,14 @@ Another package announces its own as entry points of the groups `tangram_rl.task
 loaded it.
 """
 
+from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from tangram_core.errors import ConfigError
-from tangram_core.run.code import load_code, own_code, read_code
+from tangram_core.run.code import load_code, own_code, read_code, where
 from tangram_core.settings import Settings
 
 if TYPE_CHECKING:  # a command line that is wrong need not wait for numpy
@@ -36,7 +38,15 @@ OURS: dict[Role, dict[str, str]] = {
 }
 
 
-_own: dict[tuple[Role, str], tuple[type[Any], str]] = {}  # role, name -> class, sha256
+class Own(NamedTuple):
+    """A class of a user's file."""
+
+    kind: type[Any]
+    named: str  # the whole path, and its name
+    sha256: str
+
+
+_own: dict[tuple[Role, str], Own] = {}  # role, whole path and name, or the name alone
 
 
 def find_task(kind: str) -> "type[Task]":
@@ -46,12 +56,12 @@ def find_task(kind: str) -> "type[Task]":
         ConfigError: there is none of this name, it is no task, or it stands in a file that nobody
             named.
     """
-    return _own_of("task", kind)[0] if own_code(kind) else _found("task", kind)
+    return _own_of("task", kind).kind if own_code(kind) else _found("task", kind)
 
 
 def find_agent(kind: str) -> "type[Agent]":
     """The class of an agent; errors as for `find_task`."""
-    return _own_of("agent", kind)[0] if own_code(kind) else _found("agent", kind)
+    return _own_of("agent", kind).kind if own_code(kind) else _found("agent", kind)
 
 
 def announced(role: Role) -> dict[str, str]:
@@ -75,7 +85,8 @@ def load_own(role: Role, given: str) -> None:
     path, name = own
     source, digest = read_code(role, given, path)
     found = load_code(role, given, path, name, source)
-    _own[role, name] = _checked(f"{role}={given}", role, found), digest
+    kind, whole = _checked(f"{role}={given}", role, found), f"{path.absolute()}:{name}"
+    _own[role, name] = _own[role, whole] = Own(kind, whole, digest)
 
 
 def named(role: Role, kind: str) -> dict[str, str]:
@@ -84,10 +95,10 @@ def named(role: Role, kind: str) -> dict[str, str]:
     Raises:
         ConfigError: it stands in a file that nobody named.
     """
-    own = own_code(kind)
-    if own is None:
+    if own_code(kind) is None:
         return {KIND: kind}
-    return {KIND: f"{own[0].absolute()}:{own[1]}", SHA256: _own_of(role, kind)[1]}
+    own = _own_of(role, kind)
+    return {KIND: own.named, SHA256: own.sha256}
 
 
 def identity(role: Role, kind: str) -> dict[str, str]:
@@ -96,8 +107,10 @@ def identity(role: Role, kind: str) -> dict[str, str]:
     return said | {KIND: said[KIND].rpartition(":")[2]} if SHA256 in said else said
 
 
-def _own_of(role: Role, kind: str) -> tuple[type[Any], str]:
-    found = _own.get((role, kind.rpartition(":")[2]))
+def _own_of(role: Role, kind: str) -> Own:
+    """By its path, or where that is another one on this machine, by its name."""
+    path, name = own_code(kind) or (Path(), "")
+    found = _own.get((role, f"{path.absolute()}:{name}"), _own.get((role, name)))
     if found is None:
         raise ConfigError(
             f"the settings of the run name code, {kind}, which is not loaded unless you name it: "
@@ -115,7 +128,12 @@ def _found(role: Role, kind: str) -> type[Any]:
             known = ", ".join([*OURS[role], *others])
             raise ConfigError(f"{role}.{KIND}={kind}: there is no such {role}: choose from {known}")
     module, _, name = place.partition(":")
-    found: Any = getattr(import_module(module), name, None)
+    try:
+        found: Any = getattr(import_module(module), name, None)
+    except Exception as error:
+        if kind in OURS[role]:
+            raise
+        raise ConfigError(f"{role}={kind} ({place}) cannot be loaded: {where(error)}") from error
     return found if kind in OURS[role] else _checked(f"{role}={kind} ({place})", role, found)
 
 
@@ -132,6 +150,8 @@ def _checked(what: str, role: Role, found: object) -> type[Any]:
         raise ConfigError(f"{what} has no {', '.join(lacking)}: see {base.__module__}")
     kind: Any = found
     held = kind.__dataclass_fields__
+    if not isinstance(kind.sections, Mapping):
+        raise ConfigError(f"{what}: sections must be a dict, section -> dataclass of Settings")
     for name, section in kind.sections.items():
         if not (isinstance(section, type) and issubclass(section, Settings)):
             raise ConfigError(f"{what}: sections[{name!r}] is no dataclass of Settings")

@@ -174,7 +174,7 @@ def _made(kind: type[Made], config: Mapping[str, Any], role: Role) -> Made:
     wanted = config[role].get(SHA256)
     if SHA256 in said and wanted not in (None, said[SHA256]):
         raise ConfigError(
-            f"{role}={config[role][KIND]}: the file has sha256 {said[SHA256]}, and the settings of "
+            f"{role}={said[KIND]}: the file has sha256 {said[SHA256]}, and the settings of "
             f"the run want {wanted}: name the file that it began with, or begin a new run"
         )
     own = {name: value for name, value in config[role].items() if name not in said}

@@ -123,12 +123,14 @@ class RunFolder:
 
         The copy is for the record: nothing loads it.
         """
-        self._write(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
         for setting, value in code_of(resolved).items():
             own = own_code(value)
             if own is not None:
-                source, _ = read_code(setting, value, own[0])
-                self._write(self.path / f"{setting.partition('.')[0]}_{own[0].name}", source)
+                section = setting.partition(".")[0]
+                digest = resolved[section].get("sha256")
+                source, _ = read_code(setting, value, own[0], digest)
+                self._write(self.path / f"{section}_{own[0].name}", source)
+        self._write(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
 
     def read_config(self) -> dict[str, Any]:
         """What `write_config` wrote."""

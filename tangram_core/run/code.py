@@ -9,6 +9,7 @@ import re
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -27,8 +28,11 @@ _files = set[Path]()  # that were loaded
 def own_code(name: str) -> tuple[Path, str] | None:
     """File and name of what is in it, where a setting is code of the user's own."""
     path, _, what = name.rpartition(":")
-    code = path.endswith(".py") and what.isidentifier()
-    return (Path(path).expanduser(), what) if code else None
+    if not (path.endswith(".py") and what.isidentifier()):
+        return None
+    with suppress(RuntimeError):  # there is no such user
+        return Path(path).expanduser(), what
+    return Path(path), what
 
 
 def unquoted(value: str) -> str:
@@ -112,13 +116,19 @@ def load_code(setting: str, given: str, path: Path, name: str, source: bytes) ->
         ConfigError: it cannot be loaded, or has none.
     """
     # Registered as an import would, since dataclasses look their module up. A user's file is not
-    # found by this name, and two files with one name do not meet.
-    module = ModuleType(f"_tangram_own_{hashlib.sha256(source).hexdigest()[:16]}")
-    module.__file__ = str(path)
+    # found by this name; two files with one name do not meet, and a task knows its own agent.
+    full = f"_tangram_own_{hashlib.sha256(source).hexdigest()[:16]}"
+    module = sys.modules.get(full)
     _files.add(path)
-    sys.modules[module.__name__] = module
     try:
-        exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102
+        if module is None:
+            sys.modules[full] = module = ModuleType(full)
+            module.__file__ = str(path)
+            try:
+                exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102
+            except BaseException:
+                del sys.modules[full]
+                raise
     except ImportError as error:
         raise ConfigError(
             f"{setting}={given}: cannot load '{path}' ({type(error).__name__}: {error}): it must "

@@ -123,7 +123,7 @@ class Judge:
             try:
                 with _quiet():
                     importlib.import_module(module)
-            except ImportError as error:
+            except Exception as error:  # whatever its code raises
                 raise ConfigError(
                     f"task.imports: cannot import {module} ({error}): install its package, for "
                     "gymnasium_robotics and panda_gym: pip install 'tangram-rl[robotics]'"

@@ -185,3 +185,36 @@ def test_another_package_announces_its_own(tmp_path: Path, monkeypatch: pytest.M
 def test_a_program_names_a_file_as_a_command_line_does() -> None:
     load_own("task", POINT.partition("=")[2])
     assert find_task("elsewhere/point.py:Point").__name__ == "Point"
+
+
+@pytest.mark.parametrize(
+    ("place", "text"),
+    [
+        ("agent/foo.yaml", "# @package _global_\nagent: {kind: goal}"),
+        ("agent/foo.yaml", "hydra: {callbacks: {x: {_target_: os.getcwd}}}\nkind: goal"),
+        ("agent/foo.yaml", "defaults: [/hydra/callbacks: x]\nkind: goal"),
+        ("hydra/callbacks/x.yaml", "x: {_target_: os.getcwd}"),
+    ],
+)
+def test_a_preset_calls_nothing(tmp_path: Path, place: str, text: str) -> None:
+    """Hydra makes what its own settings name, before any command is asked."""
+    (tmp_path / "mine" / place).parent.mkdir(parents=True)
+    (tmp_path / "mine" / place).write_text(text)
+    told = refused("tangram-train", "--config-dir", "mine", "agent=goal", "task=gym", cwd=tmp_path)
+    assert "hydra" in told
+
+
+def test_a_task_and_an_agent_of_one_file_know_each_other(tmp_path: Path) -> None:
+    both = tmp_path / "both.py"
+    both.write_text((EXAMPLES / "point.py").read_text() + (EXAMPLES / "td3.py").read_text())
+    load_own("task", f"{both}:Point")
+    load_own("agent", f"{both}:TD3")
+    assert find_task(f"{both}:Point").__module__ == find_agent(f"{both}:TD3").__module__
+
+
+def test_a_file_that_changed_before_its_copy_is_refused(tmp_path: Path) -> None:
+    """As by an editor, between the check and the start."""
+    changes = "\nfrom pathlib import Path\nPath(__file__).write_text('# another')\n"
+    (tmp_path / "own.py").write_text((EXAMPLES / "point.py").read_text() + changes)
+    told = refused("tangram-master", "task=own.py:Point", "agent=goal", "run_dir=run", cwd=tmp_path)
+    assert "has sha256" in told
