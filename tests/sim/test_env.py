@@ -71,10 +71,9 @@ def test_gymnasium_checks_it_without_a_warning(
         check_env(env.unwrapped)
 
 
-@pytest.mark.parametrize("imports", ["gymnasium, tangram_sim", "tangram_sim, gymnasium"])
-def test_registration_loads_no_engine(imports: str) -> None:
+def test_registration_loads_no_engine() -> None:
     script = (
-        f"import sys, {imports}; "
+        "import sys, tangram_sim.register, gymnasium; "
         "assert {'Tangram-v0', 'Tangram7-v0'} <= set(gymnasium.registry); "
         "assert not {'pybullet', 'tangram_sim.env'} & set(sys.modules); "
         "gymnasium.make('Tangram-v0', backend='kinematic').reset(); "
@@ -87,36 +86,16 @@ def test_registration_loads_no_engine(imports: str) -> None:
     assert done.stdout + done.stderr == b""  # nor does the engine tell when it was built
 
 
-def test_the_package_alone_loads_nothing_and_a_look_for_gymnasium_is_no_import() -> None:
+def test_the_package_alone_loads_nothing() -> None:
     script = (
-        "import sys, tangram_sim, importlib.util; importlib.util.find_spec('gymnasium'); "
-        "assert not {'gymnasium', 'numpy', 'torch'} & set(sys.modules); "
-        "import gymnasium; assert 'Tangram-v0' in gymnasium.registry"
-    )
-    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
-
-
-@pytest.mark.parametrize(
-    "first",
-    [
-        "import importlib, tangram_sim; importlib.reload(tangram_sim)",
-        "import sys; sys.modules['gymnasium'] = None; import tangram_sim; "
-        "del sys.modules['gymnasium']",
-        "import tangram_sim, importlib.util; spec = importlib.util.find_spec('gymnasium'); "
-        "import gymnasium; spec.loader.exec_module(gymnasium)",
-    ],
-    ids=["imported anew", "held back", "run again"],
-)
-def test_registered_once_whatever_was_done_before(first: str) -> None:
-    script = (
-        f"{first}; import gymnasium, sys; assert 'Tangram-v0' in gymnasium.registry; "
-        "assert not [one for one in sys.meta_path if type(one).__name__ == '_Finder']"
+        "import sys, tangram_sim; assert not {'gymnasium', 'numpy', 'torch'} & set(sys.modules); "
+        "import importlib, tangram_sim.register; importlib.reload(tangram_sim.register)"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
 
 
 def test_made_by_module_and_name(made: list[Any]) -> None:
-    made.append(gymnasium.make("tangram_sim:Tangram-v0", backend="kinematic"))
+    made.append(gymnasium.make("tangram_sim.register:Tangram-v0", backend="kinematic"))
     assert isinstance(made[0].unwrapped, TangramEnv)
 
 
