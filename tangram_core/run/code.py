@@ -135,7 +135,7 @@ def load_code(setting: str, given: str, path: Path, name: str, source: bytes) ->
             "be one file that needs nothing but installed packages"
         ) from error
     except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
-        raise ConfigError(f"{setting}={given}: cannot load it: {where(error)}: mend it") from error
+        raise ConfigError(f"{setting}={given}: cannot load '{path}': {where(error)}") from error
     if not hasattr(module, name):
         raise ConfigError(f"{setting}={given}: '{path}' has no '{name}'")
     return getattr(module, name)
@@ -146,5 +146,7 @@ def where(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if Path(one.filename) in _files] or frames
     line = " ".join(f"{type(error).__name__}: {error}".split())
+    if isinstance(error, SyntaxError):  # it names the place itself
+        return line
     place = f"{own[-1].filename}, line {own[-1].lineno}, in {own[-1].name}"
     return f"{line} ({place})"

@@ -203,7 +203,7 @@ def test_what_the_users_own_returns_is_checked_also_before_anything_starts(
         ("no/such.py:near", r"cannot read 'no/such.py' on this machine \(No such file or"),
         ("no/such.py:near", r"put a copy there, or say where it lies with reward\.name=path/to/"),
         ("broken.py:near", r"cannot load 'broken.py' \(ModuleNotFoundError: No module named 'no"),
-        ("half.py:near", r"cannot load 'half.py' \(SyntaxError"),
+        ("half.py:near", r"cannot load 'half.py': SyntaxError"),
         ("own.py:far", "'own.py' has no 'far'"),
         ("own.py:number", "'number' is not a function"),
     ],
