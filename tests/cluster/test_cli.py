@@ -66,7 +66,7 @@ def test_help_config_and_version_are_shown_and_leave_nothing_behind(
     text, _, examples = out.partition("Examples:\n")
     assert [line.split()[0] for line in examples.strip().splitlines()] == [command] * 3
     if command in TRAINING:
-        assert "  agent    goal, mlp, outline, paper, quick, tangram*, or path/to/file.py:Name\n" in text
+        assert "  agent    goal, mlp, outline, paper, quick, tangram*, or path/to/file.py" in text
         for group in ("tokens", "sim", "reward", "net", "service"):
             assert f"\n  {group} " in text
     assert SETTING.get(command, "seed: 0") in text
