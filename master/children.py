@@ -186,14 +186,6 @@ def command(name: str) -> list[str]:
     return ["-P", "-m", "tangram_cli", name]
 
 
-def override(name: str, value: str) -> str:
-    """A setting whose value may hold anything, such as a path with blanks or `=`, or is a list."""
-    if value.startswith("["):
-        return f"{name}={value}"
-    escaped = value.replace("'", "\\'")
-    return f"{name}='{escaped}'"
-
-
 def environment() -> dict[str, str]:
     """One thread each, since several processes share the cores, and the same packages as here."""
     variables = dict.fromkeys(THREADS, "1") | dict(os.environ)

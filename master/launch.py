@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from master.children import MAX_RESTARTS, Child, command, describe, override
+from master.children import MAX_RESTARTS, Child, command, describe
 from master.config import MasterConfig
 from master.hub.security import listening_place
 from master.record.resumable import check_resumable
@@ -17,7 +17,7 @@ from master.record.rundir import RunFolder
 from master.signals import SAME_WISH_S, SIGNALS, show_cursor, stop_notice
 from master.watch.console import logging_to, sturdy_console
 from master.watch.result import show_finished
-from tangram_core.run.code import code_of
+from tangram_core.run.code import code_of, override
 from tangram_core.run.process import WATCHDOG_S, Every, handling, watch_parent
 from tangram_core.wire.messages import TAKEN_OVER
 

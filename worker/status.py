@@ -5,7 +5,6 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import zmq
@@ -14,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tangram_core.errors import TangramError, WireError
-from tangram_core.run.code import code_of
+from tangram_core.run.code import argument, code_of
 from tangram_core.run.outcome import FILE_NAME, duration, outcome_rows, read_outcome
 from tangram_core.scores import read, told
 from tangram_core.store.stored import CONFIG
@@ -140,8 +139,12 @@ def _evaluator(connect: str) -> str:
     if address is not None and address.keys and "evaluator" not in address.keys:
         return f"{connect} has no key for one, tangram-keys makes it (add=NAME role=evaluator)"
     own = {} if address is None else code_of(address.settings or {})
-    named = "".join(f" {quote(f'{name}={value}')}" for name, value in own.items())
-    return f"tangram-worker connect={connect} role=evaluator{named}"
+    given = [
+        argument("connect", connect),
+        "role=evaluator",
+        *(argument(*one) for one in own.items()),
+    ]
+    return " ".join(["tangram-worker", *given])
 
 
 def _print_rows(console: Console, rows: Iterable[tuple[str, str]]) -> None:

@@ -3,7 +3,6 @@
 import logging
 import os
 import platform
-import re
 import shlex
 import subprocess
 import sys
@@ -16,16 +15,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from master.children import override
 from master.config import MasterConfig
 from master.record.rundir import RunFolder
 from master.watch.console import TEST, sturdy_console
-from tangram_core.run.code import code_of
+from tangram_core.run.code import argument, code_of
 from tangram_core.run.outcome import outcome_rows, read_outcome
 from tangram_core.scores import Score, written
 from tangram_core.wire.messages import RunStatus
 
-PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
 ROOT = Path(__file__).resolve().parents[2]
 log = logging.getLogger(__name__)
 
@@ -116,7 +113,7 @@ def show_finished(folder: RunFolder, log_format: str, code: Mapping[str, str]) -
 
 def command_line(name: str, settings: Mapping[str, object]) -> str:
     """A command of this installation with settings, to be pasted into a shell."""
-    return " ".join([_installed(name), *(_argument(*pair) for pair in settings.items())])
+    return " ".join([_installed(name), *(argument(*pair) for pair in settings.items())])
 
 
 def go_on_command(folder: RunFolder, launched: bool) -> str:
@@ -139,12 +136,6 @@ def go_on_command(folder: RunFolder, launched: bool) -> str:
 def _installed(name: str) -> str:
     """A command of this environment as a shell finds it, which may not have the environment on."""
     return name if which(name) else shlex.quote(str(Path(sys.executable).with_name(name)))
-
-
-def _argument(name: str, value: object) -> str:
-    """A setting; quoted for the shell and for the config if needed."""
-    plain = f"{name}={value}"
-    return plain if PLAIN.fullmatch(plain) else shlex.quote(override(name, str(value)))
 
 
 def versions() -> dict[str, str]:

@@ -6,6 +6,7 @@ where a command line, or a program, names it itself.
 
 import hashlib
 import re
+import shlex
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,7 @@ MODULES = "task.imports"
 # Argument -> section and setting that may hold path/to/file.py:Name.
 NAMES = {"task": ("task", "kind"), "agent": ("agent", "kind"), "reward.name": ("reward", "name")}
 KNOWN = ("gymnasium_robotics", "panda_gym")  # modules of the extra `robotics`
+PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
 
 _named = set[str]()  # modules
 _files = set[Path]()  # that were loaded
@@ -33,6 +35,20 @@ def own_code(name: str) -> tuple[Path, str] | None:
     with suppress(RuntimeError):  # there is no such user
         return Path(path).expanduser(), what
     return Path(path), what
+
+
+def override(name: str, value: str) -> str:
+    """A setting whose value may hold anything, such as a path with blanks or `=`, for hydra."""
+    if name == MODULES:  # a list, and it stays one
+        return f"{name}={value}"
+    escaped = value.replace("'", "\\'")
+    return f"{name}='{escaped}'"
+
+
+def argument(name: str, value: object) -> str:
+    """A setting to be pasted into a shell; quoted for it and for hydra where it must be."""
+    plain = f"{name}={value}"
+    return plain if PLAIN.fullmatch(plain) else shlex.quote(override(name, str(value)))
 
 
 def unquoted(value: str) -> str:

@@ -11,8 +11,9 @@ from typing import Any
 import psutil
 import zmq
 
-from master.children import command, override
+from master.children import command
 from tangram_core.errors import TangramError
+from tangram_core.run.code import override
 from tangram_core.run.process import Lifeline
 from worker.status import ask_status
 

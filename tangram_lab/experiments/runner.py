@@ -10,10 +10,11 @@ from typing import Any
 
 from rich.console import Console
 
-from master.children import Child, command, describe, override
+from master.children import Child, command, describe
 from master.record.rundir import RunFolder
 from master.signals import SIGNALS
 from tangram_core.errors import ConfigError
+from tangram_core.run.code import override
 from tangram_core.run.process import handling
 from tangram_core.store.files import write_whole
 from tangram_lab.experiments.rows import COLUMNS, CURVE, append, curve_rows, done, rows_of

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from conf.cli import composed
-from master.children import override
 from tangram_core.registry import find_agent, find_task, load_own
+from tangram_core.run.code import override
 from tests.cluster.processes import LIMIT_S, refused, run_here, started, wait_for_file
 from tests.cluster.test_cli import READ
 from tests.core.examples import EXAMPLES
@@ -132,6 +132,7 @@ BROKEN = [
 WHOLE = """
 from tangram_core.agent import Agent
 from tangram_core.settings import Settings
+from tangram_core.run.code import override
 class Config(Settings, section="agent"): pass
 class Kind(Settings, section="agent"): kind = "x"
 class Whole(Agent): actor = learner = pace = None

@@ -1,16 +1,19 @@
 """Tasks and agents keep the promises of their interfaces, and who breaks one is told."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import tests.core.toy  # noqa: F401 - registers environments
 from tangram_agent.agents.goal.agent import Goal, GoalConfig
+from tangram_agent.flat.actor_critic import Loss
 from tangram_core.agent import Agent
 from tangram_core.conformance import ConformanceError, check_agent, check_task
+from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
 from tangram_core.task import Task
 from tangram_tasks.gym.task import Gym, GymConfig
@@ -151,6 +154,7 @@ def test_a_task_that_breaks_a_promise_is_told(fault: str, told: str) -> None:
             {"rivals": lambda self: {"two": lambda env: lambda *_: np.full((3, 2), 2, "f4")}},
             ".rivals",
         ),
+        ({"rewards": lambda self, a, d: np.zeros((len(a), 1))}, r".rewards: wanted shape \(3,\)"),
         ({"draw": lambda self, played: np.zeros((4, 4))}, ".draw: wanted uint8"),
         ({"identity": lambda self: {"task": self}}, ".identity: wanted what JSON"),
     ],
@@ -186,4 +190,42 @@ def test_an_agent_that_breaks_a_promise_is_told(changes: Mapping[str, Any], told
     learner = type("Wrong", (TD3.TD3Learner,), dict(changes))
     agent = type("Agent", (TD3.TD3,), {"learns": lambda self: learner})(TD3.TD3Config(**SMALL))
     with pytest.raises(ConformanceError, match=f"^Wrong{told}"):
+        check_agent(agent, POINT.Point())
+
+
+def test_actions_are_of_the_tasks_size_also_where_nothing_is_explored() -> None:
+    policy = TD3.TD3.policy
+    wide = type("Agent", (TD3.TD3,), {"policy": lambda self, inputs, _: policy(self, inputs, 3)})
+    with pytest.raises(ConformanceError, match=r"actions to be float32 \(3, 2\), got .*3, 3"):
+        check_agent(wide(TD3.TD3Config(**SMALL)), POINT.Point())
+
+
+def only(part: str, loss: Callable[[Any], Any]) -> Any:
+    """Losses of one network alone."""
+
+    def losses(self: Any, batch: Any) -> Any:
+        yield Loss(part, loss(sum(self.critic(batch.rows, batch.actions))))
+
+    return losses
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"losses": only("critics", torch.mean)}, "losses: wanted one of actor, critic, got a Los"),
+        ({"losses": only("critic", lambda one: one)}, "losses: wanted a single number, got a Loss"),
+        (
+            {"losses": only("critic", torch.mean)},
+            "losses: wanted a Loss of each .* none of",
+        ),
+        (
+            {"target_names": lambda _: "critic"},
+            "target_names: wanted names of actor, critic",
+        ),
+    ],
+)
+def test_losses_that_cannot_be_learned_are_told(changes: Mapping[str, Any], told: str) -> None:
+    learner = type("Wrong", (TD3.TD3Learner,), dict(changes))
+    agent = type("Agent", (TD3.TD3,), {"learns": lambda self: learner})(TD3.TD3Config(**SMALL))
+    with pytest.raises(ConfigError, match=f"^Wrong.{told}"):
         check_agent(agent, POINT.Point())

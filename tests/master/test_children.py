@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master import children as children_module
-from master.children import MAX_RESTARTS, Child, describe, environment, override
+from master.children import MAX_RESTARTS, Child, describe, environment
+from tangram_core.run.code import override
 
 LIMIT_S = 100.0
 

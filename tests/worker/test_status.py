@@ -5,6 +5,7 @@ import re
 from collections import defaultdict
 from dataclasses import asdict, replace
 from pathlib import Path
+from shlex import split
 
 import pytest
 import zmq
@@ -104,7 +105,7 @@ def test_the_line_that_starts_an_evaluator_works_as_it_is(tmp_path: Path) -> Non
     mine = content | {"settings": {"reward": {"name": "/my own.py:near"}}}
     path.write_text(json.dumps(mine))
     start = f"tangram-worker connect={path} role=evaluator"
-    assert _evaluator(str(path)) == f"{start} 'reward.name=/my own.py:near'"
+    assert split(_evaluator(str(path))) == [*split(start), "reward.name='/my own.py:near'"]
     assert _evaluator("h:1") == "tangram-worker connect=h:1 role=evaluator"
     pair, server = asdict(make_pair()), make_pair().public
     path.write_text(json.dumps(content | {"server_key": server, "keys": {"player": pair}}))

@@ -8,9 +8,9 @@ from threading import Timer
 
 import psutil
 
-from master.children import override
 from master.record.journal import segments
 from tangram_core.errors import TangramError
+from tangram_core.run.code import override
 from tangram_core.wire.messages import EpisodeBatch
 from tangram_core.wire.schema import MAX_COUNT
 from tangram_lab.benchmarks.trials.chaos import Witness, compare
