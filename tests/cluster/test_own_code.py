@@ -219,3 +219,22 @@ def test_a_file_that_changed_before_its_copy_is_refused(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text((EXAMPLES / "point.py").read_text() + changes)
     told = refused("tangram-master", "task=own.py:Point", "agent=goal", "run_dir=run", cwd=tmp_path)
     assert "has sha256" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["task=own.py"], "task=own.py: name the class in it, as in task=path/to/file.py:Name"),
+        (["from_config=x.yaml", "--cfg", "job"], "--cfg shows presets and arguments alone"),
+        (["agent=a.py:A,b.py:B"], "one file at a time: give a sweep for each"),
+    ],
+)
+def test_what_cannot_be_meant_is_told(tmp_path: Path, arguments: list[str], told: str) -> None:
+    assert told in refused("tangram-train", *arguments, cwd=tmp_path)
+
+
+def test_help_is_that_of_the_agent_that_is_named(tmp_path: Path) -> None:
+    for agent, setting in (("goal", "agent.moved_share"), ("mlp", "agent.saturation_penalty")):
+        assert setting in run_here(
+            "tangram-train", f"agent={agent}", "--help", "agent", cwd=tmp_path
+        )
