@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from conf.kinds import Kinds, every_kind
-from tangram_core.registry import KIND
+from tangram_core.run.code import KIND
 from tangram_core.settings import Settings, declared_fields, setting
 
 Plain = dict[str, Any]

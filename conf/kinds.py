@@ -12,8 +12,8 @@ from typing import Any
 import yaml
 
 from tangram_core.errors import ConfigError
-from tangram_core.registry import AGENT, KIND, OURS, TASK, find_agent, find_task
-from tangram_core.run.code import unquoted
+from tangram_core.registry import AGENT, OURS, TASK, find_agent, find_task
+from tangram_core.run.code import KIND, unquoted
 from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import Settings
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 from conf.help import choices
 from tangram_core.errors import ConfigError
-from tangram_core.registry import KIND, Role, announced, load_own
-from tangram_core.run.code import MODULES, name_modules, own_code, unquoted
+from tangram_core.registry import Role, announced, load_own
+from tangram_core.run.code import KIND, name_modules, names_modules, own_code, unquoted
 
 ROLES: tuple[Role, ...] = ("task", "agent")
 
@@ -25,14 +25,16 @@ def with_named_code(arguments: Sequence[str]) -> list[str]:
 
 def without_named_code(arguments: Sequence[str]) -> list[str]:
     """For a command that plays trained runs, which have a task and an agent already."""
-    names = (MODULES, *(f"{role}.{KIND}" for role in ROLES))
-    return [one for one in arguments if one.lstrip("+").partition("=")[0] not in names]
+    names = [one.lstrip("+").partition("=")[0] for one in arguments]
+    kinds = {f"{role}.{KIND}" for role in ROLES}
+    named = zip(names, arguments, strict=True)
+    return [one for name, one in named if not names_modules(name) and name not in kinds]
 
 
 def _named(argument: str) -> str:
     name, _, value = argument.lstrip("+").partition("=")
     plain = unquoted(value)
-    if name == MODULES:
+    if names_modules(name):
         name_modules(plain)
     for role in ROLES:
         if name in (role, f"{role}.{KIND}") and own_code(plain) is not None:

@@ -250,13 +250,8 @@ def _make_trainer(
             warm_start(Path(config.warm_start), trainer)
     if service.compile:
         log.info("compiles its update: up to a minute at first, seconds once it was compiled here")
-        trainer.learner.prepare()
-        watchdog.progress()
-    elif device == "cuda" and trainer.learner.compiles:
-        log.info(
-            "learns by single operations, which leave a GPU idle: a new run with "
-            "service.compile=true is faster (needs g++ or clang++)"
-        )
+    trainer.learner.prepare()
+    watchdog.progress()
     return trainer, found
 
 

@@ -18,7 +18,8 @@ from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_core.agent import Actor, Weights
 from tangram_core.arrays import Floats, Singles
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.registry import KIND, SHA256
+from tangram_core.registry import SHA256
+from tangram_core.run.code import KIND
 from tangram_core.settings import (
     KEY,
     LEARNING,

@@ -99,7 +99,7 @@ class Learner(ABC):
         parameters: numbers that are learned.
         device: where, for reports.
         capacity: transitions that are kept, or states, at most.
-        compiles: whether its updates can be compiled.
+        compiles: whether its updates can be made a graph, by a compiler or by a GPU.
     """
 
     streams: tuple[str, ...] = ("replay", "hindsight")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from tangram_core.errors import ConfigError
-from tangram_core.run.code import load_code, own_code, read_code, where
+from tangram_core.run.code import KIND, load_code, own_code, read_code, where
 from tangram_core.settings import Settings
 
 if TYPE_CHECKING:  # a command line that is wrong need not wait for numpy
@@ -21,7 +21,6 @@ if TYPE_CHECKING:  # a command line that is wrong need not wait for numpy
 
 Role = Literal["task", "agent"]
 TASK, AGENT = "task", "agent"  # the sections that every run has
-KIND = "kind"  # the setting that names it, in the section of its role
 SHA256 = "sha256"  # of the file that it stands in, beside its name
 OURS: dict[Role, dict[str, str]] = {
     "task": {

@@ -12,7 +12,6 @@ from tangram_core.agent import Agent
 from tangram_core.errors import ConfigError
 from tangram_core.registry import (
     AGENT,
-    KIND,
     SHA256,
     TASK,
     Role,
@@ -21,6 +20,7 @@ from tangram_core.registry import (
     identity,
     named,
 )
+from tangram_core.run.code import KIND
 from tangram_core.settings import KEY, NETWORK, Settings, declared_fields
 from tangram_core.spec import EpisodeSpec
 from tangram_core.task import Task

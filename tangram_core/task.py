@@ -12,7 +12,6 @@ import numpy as np
 
 from tangram_core.arrays import Bools, Floats, Pixels, Singles
 from tangram_core.scores import Score
-from tangram_core.seeding import episode_generator
 from tangram_core.settings import Settings
 from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
 
@@ -201,10 +200,6 @@ class Task(ABC):
     def draw(self, played: Played) -> Pixels | None:  # noqa: ARG002
         """A picture (H, W, 3) of a few test episodes; None: there is none to be drawn."""
         return None
-
-    def tests(self, count: int, seed: int = 0) -> Generators:
-        """The fixed test set; the first tests of a larger one are those of a smaller one."""
-        return [episode_generator(seed, "evaluation", 0, 0, number) for number in range(count)]
 
     def pinned(self) -> Self:
         """With whatever code of the user's own it loads named by its content."""

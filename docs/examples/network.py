@@ -10,6 +10,7 @@ from torch import nn
 
 from tangram_agent.agents.scene.agent import Scene
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
+from tangram_agent.nets.networks import perceptron
 
 
 class SetsHead(nn.Module):
@@ -18,12 +19,8 @@ class SetsHead(nn.Module):
     def __init__(self, graph, net, outputs, *, at_base, action=0):
         super().__init__()
         self.graph, width = graph, net.width
-        self.nodes = nn.Sequential(
-            nn.Linear(graph.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
-        )
-        self.read = nn.Sequential(
-            nn.Linear(2 * width + action, width), nn.ReLU(), nn.Linear(width, outputs)
-        )
+        self.nodes = perceptron(graph.features, (width,), width)
+        self.read = perceptron(2 * width + action, (width,), outputs)
 
     def see(self, view):
         return self.graph.node_features(view)  # (M, N, F)

@@ -49,18 +49,19 @@ class Adam:
                 one.copy_(slots[name][i] if slots else torch.zeros_like(one))
 
     @torch.no_grad()
-    def step(self, gradients: Sequence[Tensor], rate: float | Tensor) -> None:
+    def step(self, gradients: Sequence[Tensor], rate: float | Tensor, traced: bool = False) -> None:
         """One step along the gradient of each parameter.
 
         Args:
             gradients: one for each parameter.
-            rate: of this step; a tensor where the step is traced: then it is told in operations
-                that a compiler can fuse, else one kernel of torch does it all.
+            rate: of this step; a tensor of one number where it is part of a graph.
+            traced: whether it is told in operations that a compiler can fuse, of a tensor as its
+                rate; else one kernel of torch does it all.
         """
         steps, means, squares = (self.slots[name] for name in NAMES)
-        if isinstance(rate, Tensor):
+        if traced:
             for one in zip(self._parameters, gradients, means, squares, steps, strict=True):
-                _told(*one, rate)
+                _told(*one, torch.as_tensor(rate))
             return
         adam(
             self._parameters,

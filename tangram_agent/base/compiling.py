@@ -1,13 +1,13 @@
-"""One update as a single graph, compiled: both gradients, both optimisers and all averages.
+"""One update as a whole: both gradients, both optimisers and all averages.
 
 An update of small networks is a thousand small operations, and most of its time goes from one to
-the next. So the update is traced once, as it is, and torch's compiler makes one piece of C++ of
-it, or kernels of Triton on a GPU. Those are recorded as a CUDA graph, which the processor asks for
-as a whole. What was compiled is kept in a folder for the next run. Numbers differ from those of
-single operations in their last digits: a run learns one way or the other from its beginning to its
-end.
+the next. On a GPU they are recorded once as a CUDA graph, which the processor asks for as a whole.
+Compiled, the update is traced once, as it is, and torch's compiler makes one piece of C++ of it, or
+kernels of Triton for the graph. What was compiled is kept in a folder for the next run; its numbers
+differ from those of single operations in their last digits, so a run stays with it or without it.
 """
 
+import logging
 import os
 import platform
 import re
@@ -27,6 +27,11 @@ from tangram_core.errors import RunError
 
 _CACHE_SETTING = "TORCHINDUCTOR_CACHE_DIR"
 _FLAGS = re.compile(rb"^(?:flags|Features)\s*:(.*)$", re.MULTILINE)
+# Of arguments and rates: as a graph takes them, and as it is called.
+Call = Callable[[list[Tensor], list[Tensor]], Tensor]
+Called = Callable[[list[Tensor], list[float]], Tensor]
+
+log = logging.getLogger(__name__)
 
 
 def cache_folder() -> Path:
@@ -42,41 +47,51 @@ def cache_folder() -> Path:
     return Path(os.environ.get(_CACHE_SETTING, own))
 
 
-class Compiled:
-    """A function of tensors in dataclasses, and of rates, that changes other tensors in place."""
+class Whole:
+    """A function of tensors in dataclasses, and of rates, that changes other tensors in place.
 
-    def __init__(self, function: Callable[..., Tensor], changed: Sequence[Tensor]) -> None:
-        """Compile it when it is called first, and for each form of its arguments.
+    On a GPU it is recorded; compiled it is where that is wanted.
+    """
+
+    def __init__(
+        self, function: Callable[..., Tensor], changed: Sequence[Tensor], compiled: bool
+    ) -> None:
+        """Make a graph of it when it is called first, and for each form of its arguments.
 
         Args:
             function: of a dataclass and of a tuple of rates.
             changed: what it changes; these must stay the same tensors.
+            compiled: by torch's compiler; else it stays the single operations that it is made of.
         """
-        os.environ[_CACHE_SETTING] = str(cache_folder())
-        self._function, self._changed = function, changed
-        self._graphs: dict[Any, Callable[..., Tensor]] = {}
+        if compiled:
+            os.environ[_CACHE_SETTING] = str(cache_folder())
+        self._function, self._changed, self._compiled = function, changed, compiled
+        self._graphs: dict[Any, Called] = {}
 
     def __call__(self, steps: Any, rates: tuple[float | Tensor, ...]) -> Tensor:
         """What the function gives; the rates reach it as tensors."""
         tensors: list[Tensor] = []
         form = _form(steps, tensors, {})
-        device = tensors[0].device
-        numbers = [torch.tensor(float(rate), device=device) for rate in rates]
+        values = [float(rate) for rate in rates]
         if form not in self._graphs:
-            self._graphs[form] = self._graph(steps, type(rates), tensors, numbers)
-        with torch.no_grad():
-            return self._graphs[form](tensors, numbers)
+            numbers = [torch.tensor(value, device=tensors[0].device) for value in values]
+            make = self._graph if self._compiled else self._single
+            call = make(steps, type(rates), tensors, numbers)
+            self._graphs[form] = self._recorded(call, tensors, numbers)
+        return self._graphs[form](tensors, values)
 
     def prepare(self, steps: Any, rates: tuple[float | Tensor, ...]) -> None:
-        """Compile it for arguments of this form; nothing is changed.
+        """Make its graph for arguments of this form; nothing is changed.
 
         Raises:
             RunError: the compiler fails, or what it keeps is damaged or cannot be written.
         """
         try:
-            with self._unchanged():
+            with self.unchanged():
                 self(steps, rates)
         except (OSError, ImportError, RuntimeError) as error:
+            if not self._compiled:
+                raise
             why = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
             raise RunError(
                 f"the update cannot be compiled ({why}): empty {cache_folder()} if that was of "
@@ -84,17 +99,31 @@ class Compiled:
             ) from error
 
     @contextmanager
-    def _unchanged(self) -> Iterator[None]:
+    def unchanged(self) -> Iterator[None]:
         """What is changed within is undone."""
         before = [one.detach().clone() for one in self._changed]
-        yield
-        with torch.no_grad():
-            for one, old in zip(self._changed, before, strict=True):
-                one.copy_(old)
+        try:
+            yield
+        finally:
+            with torch.no_grad():
+                for one, old in zip(self._changed, before, strict=True):
+                    one.copy_(old)
+
+    def _single(
+        self, steps: Any, kind: Callable[..., Any], tensors: list[Tensor], _: list[Tensor]
+    ) -> Call:
+        """The function as it is."""
+
+        def call(given: list[Tensor], rates: list[Tensor]) -> Tensor:
+            own = dict(zip(map(id, tensors), given, strict=True))
+            return self._function(_with(steps, own, {}), kind(*rates))
+
+        return call
 
     def _graph(
         self, steps: Any, kind: Callable[..., Any], tensors: list[Tensor], numbers: list[Tensor]
-    ) -> Callable[..., Tensor]:
+    ) -> Call:
+        """The function, compiled."""
         # Only here: the compiler takes seconds and 200 MB to load.
         from torch._inductor import standalone_compile  # noqa: PLC0415
         from torch.fx.experimental.proxy_tensor import make_fx  # noqa: PLC0415
@@ -105,7 +134,7 @@ class Compiled:
             own = dict(zip(map(id, tensors), given[:count], strict=True))
             return (self._function(_with(steps, own, {}), kind(*given[count:])),)
 
-        with self._unchanged():  # it is traced by doing it once
+        with self.unchanged():  # it is traced by doing it once
             graph, constants = _lifted(make_fx(flat)(*tensors, *numbers))
         example: list[Any] = [*constants, *tensors, *numbers]
         patches = {
@@ -124,17 +153,20 @@ class Compiled:
                 options={"config_patches": patches},
             )
 
+        @torch.no_grad()
         def call(given: list[Tensor], rates: list[Tensor]) -> Tensor:
             found: Tensor = compiled(*constants, *given, *rates)[0]
             return found
 
-        on_gpu = tensors[0].device.type == "cuda"
-        return self._recorded(call, tensors, numbers) if on_gpu else call
+        return call
 
-    def _recorded(
-        self, call: Callable[..., Tensor], tensors: list[Tensor], numbers: list[Tensor]
-    ) -> Callable[..., Tensor]:
-        """The same as a CUDA graph, which has places of its own for its arguments."""
+    def _recorded(self, call: Call, tensors: list[Tensor], numbers: list[Tensor]) -> Called:
+        """The same as a CUDA graph, which has places of its own for its arguments.
+
+        As it is where there is no GPU, or where it does what no graph can: wait for a value, say.
+        """
+        if not tensors[0].is_cuda:
+            return _filled(call)
         given = [
             torch.empty_strided(one.shape, one.stride(), dtype=one.dtype, device=one.device)
             for one in (*tensors, *numbers)
@@ -142,22 +174,43 @@ class Compiled:
         own, rates = given[: len(tensors)], given[len(tensors) :]
         torch._foreach_copy_(given, [*tensors, *numbers])
         graph, aside = torch.cuda.CUDAGraph(), torch.cuda.Stream()  # type: ignore[no-untyped-call]
-        with self._unchanged(), torch.no_grad():
+        with self.unchanged():
             # What is done at first only must not be recorded, such as the choice of a kernel.
             aside.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(aside):
                 call(own, rates)
             torch.cuda.current_stream().wait_stream(aside)
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                found = call(own, rates)
+            try:
+                with (  # the outer one: what fails in the inner one leaves its stream behind
+                    torch.cuda.stream(torch.cuda.current_stream()),
+                    torch.cuda.graph(graph, capture_error_mode="thread_local"),
+                ):
+                    found = call(own, rates)
+            except RuntimeError as error:
+                why = str(error).partition("\n")[0]
+                log.warning("updates are not recorded, and slow: %s", why)
+                return _filled(call)
 
-        def replay(tensors: list[Tensor], numbers: list[Tensor], _: Any = call) -> Tensor:
+        def replay(tensors: list[Tensor], values: list[float], _: Any = call) -> Tensor:
             # The graph reads its constants where they lie: `call` keeps them.
-            torch._foreach_copy_(given, [*tensors, *numbers])
+            torch._foreach_copy_(own, tensors)
+            for rate, value in zip(rates, values, strict=True):
+                rate.fill_(value)
             graph.replay()
             return found.clone()
 
         return replay
+
+
+def _filled(call: Call) -> Called:
+    """The same of rates as numbers."""
+
+    def filled(tensors: list[Tensor], values: list[float]) -> Tensor:
+        return call(
+            tensors, [tensors[0].new_tensor(value, dtype=torch.float32) for value in values]
+        )
+
+    return filled
 
 
 def _lifted(traced: GraphModule) -> tuple[GraphModule, list[Tensor]]:

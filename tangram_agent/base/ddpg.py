@@ -79,7 +79,7 @@ class Ddpg(TokenLearner):
             networks: actor, critic, and what is played with.
             seed: of the weights.
             device: where it learns.
-            compiled: whether an update is compiled as a whole, see `Compiled`.
+            compiled: whether an update is compiled as a whole, see `Whole`.
             others: networks that are fitted otherwise.
         """
         self.task, self.config, self.polyak = task, config, config.polyak

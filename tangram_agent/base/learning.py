@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.base.adam import Adam
-from tangram_agent.base.compiling import Compiled
+from tangram_agent.base.compiling import Whole
 from tangram_agent.base.config import LearningConfig
 from tangram_agent.nets.networks import initialise, parameter_count
 from tangram_agent.nets.weights import load_arrays, to_arrays, under
@@ -24,7 +24,7 @@ _COUNTER = "updates"
 
 
 class Rates(NamedTuple):
-    """Learning rates of an update, and how much the running average keeps; tensors where traced."""
+    """Learning rates of an update, and how much the running average keeps; tensors in a graph."""
 
     actor: float | Tensor
     critic: float | Tensor
@@ -99,7 +99,8 @@ class NetworkLearner(Learner):
             learned: networks that are learned by gradients, by name.
             targets: names of those that have a target network.
             device: where it learns.
-            compiled: whether an update is compiled as a whole, see `Compiled`.
+            compiled: whether an update is compiled as a whole, see `Whole`; on a GPU it is
+                recorded in any case.
             others: networks that are fitted otherwise.
         """
         for name in targets:
@@ -118,10 +119,11 @@ class NetworkLearner(Learner):
         self.optimisers: dict[str, Optimiser] = {name: Adam(self.lists[name]) for name in learned}
         self.names: dict[bool, tuple[str, ...]] = {}
         self._whole: Callable[[Any, Rates], Tensor] = self.step
-        if compiled:
+        self._traced = compiled
+        if self.compiles and (compiled or self.place.type == "cuda"):
             slots = [own for each in self.optimisers.values() for own in each.slots.values()]
             changed = [one for own in (*self.lists.values(), *slots) for one in own]
-            self._whole = Compiled(self.step, changed)
+            self._whole = Whole(self.step, changed, compiled)
 
     # What a learner of its own says
 
@@ -185,8 +187,8 @@ class NetworkLearner(Learner):
             self._check(loss)
             rate = rates.actor if loss.part == "actor" else rates.critic
             gradients = torch.autograd.grad(loss.value, self.lists[loss.part])
-            norm = gradient_norm(gradients, traced=isinstance(rate, Tensor))
-            self.optimisers[loss.part].step(gradients, rate)
+            norm = gradient_norm(gradients, self._traced)
+            self.optimisers[loss.part].step(gradients, rate, self._traced)
             own = {f"{loss.part}_loss": loss.value, f"{loss.part}_gradient": norm}
             numbers |= own | dict(loss.told)
         self.follow(rates)
@@ -207,10 +209,23 @@ class NetworkLearner(Learner):
         raise ConfigError(f"{type(self).__name__}.{method}: wanted {wanted}, got {came}")
 
     def prepare(self) -> None:
-        """Compile updates that are to be compiled: else the first ones take a minute."""
-        if isinstance(self._whole, Compiled):
+        """Make graphs of updates: compiled, the first ones would take a minute."""
+        if isinstance(self._whole, Whole):
             for seen in self.blanks():
                 self._whole.prepare(seen, self.rates(0.0))
+                self._check_steady(self._whole, seen)
+
+    def _check_steady(self, whole: Whole, seen: Any) -> None:
+        """Refuse losses that hang on how many updates were made: a graph has them as they were."""
+        made, rates, numbers = self.updates, self.rates(0.0), list[Tensor]()
+        for self.updates in (made, made + 10**6):
+            with whole.unchanged():
+                numbers.append(self.step(seen, rates))
+        self.updates = made
+        if not torch.allclose(numbers[0], numbers[1], rtol=1e-2, atol=1e-5, equal_nan=True):
+            wanted = "the same of the same batch, so that a GPU or a compiler may repeat them"
+            came = "others after more updates: draw what changes with the batch, or set compiles"
+            self.refuse("losses", f"{came} = False in the class", wanted)
 
     def tensor(self, array: Array, dtype: type = np.float32) -> Tensor:
         """On the device, in single precision where no other type is said."""
@@ -351,7 +366,7 @@ def frozen(module: nn.Module) -> nn.Module:
 def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float | Tensor) -> None:
     """Eq. 4: target <- rho * target + (1 - rho) * source, parameter by parameter."""
     with torch.no_grad():
-        if isinstance(rho, Tensor):  # the update is traced
+        if isinstance(rho, Tensor):  # of a graph
             for target, source in zip(targets, sources, strict=True):
                 target.lerp_(source, 1.0 - rho)
         else:

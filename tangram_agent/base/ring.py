@@ -113,6 +113,6 @@ class Ring:
             ):
                 raise RunError(
                     f"replay state: '{name}' must be {wanted.dtype} {(kept, *wanted.shape[1:])} "
-                    f"within {column.low:g} and {column.high:g}: it is of other tokens, another "
+                    f"within {column.low:g} and {column.high:g}: it is of another "
                     "task or another version, or damaged: start a new run"
                 )

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from tangram_agent.base.learning import Loss, NetworkLearner, Rates
 from tangram_agent.flat.agent import ActorCriticAgent
 from tangram_agent.flat.config import BaseConfig
-from tangram_agent.flat.inputs import Inputs, Normaliser
+from tangram_agent.flat.inputs import Inputs, Normaliser, normalised
 from tangram_agent.flat.playing import MEAN, POLICY, SCALE
 from tangram_agent.flat.replay import EpisodeReplay
 from tangram_agent.nets.weights import to_arrays, under
@@ -85,7 +85,7 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         self._task, self._inputs = task, Inputs(task.spec)
         self.size, self.actions = self._inputs.size, task.spec.action_size
         self._normaliser = Normaliser(self.size)
-        self.replay = EpisodeReplay(task, self.config.replay_capacity)
+        self.replay = EpisodeReplay(task, self.config.replay_capacity, torch.device(device))
         self.capacity = self.replay.capacity * task.spec.horizon
         with torch.random.fork_rng(devices=[]):  # what others draw from torch stays as it is
             torch.default_generator.manual_seed(seed)
@@ -98,6 +98,7 @@ class ActorCritic(NetworkLearner, Generic[Config]):
                     "LayerNorm in the place of BatchNorm"
                 )
         super().__init__(learned, self.target_names(), device, compiled=compiled)
+        self._settle()
 
     @abstractmethod
     def modules(self) -> dict[str, nn.Module]:
@@ -127,6 +128,7 @@ class ActorCritic(NetworkLearner, Generic[Config]):
     def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
         """Keep whole episodes: goals are relabelled when a batch is drawn."""
         self._normaliser.add(self._inputs.of_episodes(episodes))
+        self._settle()
         self.replay.add(episodes)
         return episodes.transitions
 
@@ -147,16 +149,22 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         return numbers
 
     def drawn(self, rng: Streams) -> Batch:
-        """What the next update learns from: all that is random in it is drawn here."""
+        """What the next update learns from: all that is random in it is drawn here.
+
+        Which transitions, with which goals, is drawn on the processor; what was seen lies on the
+        device already.
+        """
         found = self.replay.sample(self.config, rng)
-        shape = (self.draws, *found.actions.shape)
-        self.batch = batch = self._on_device(
-            self._normaliser(self._inputs.rows(found.before)),
-            found.actions,
-            found.rewards,
-            1.0 - found.terminated,
-            self._normaliser(self._inputs.rows(found.after)),
-            rng["replay"].standard_normal(shape, np.float32),
+        rows, steps = self.tensor(found.rows, np.int64), self.tensor(found.steps, np.int64)
+        desired = self.tensor(found.desired)
+        shape = (self.draws, self.config.batch_size, self.actions)
+        self.batch = batch = self._batch(
+            self._rows(self.replay.seen(rows, steps, desired)),
+            self.replay.actions(rows, steps),
+            self.tensor(found.rewards),
+            self.tensor(1.0 - found.terminated),
+            self._rows(self.replay.seen(rows, steps + 1, desired)),
+            self.tensor(rng["replay"].standard_normal(shape, np.float32)),
         )
         return batch
 
@@ -165,12 +173,24 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         count, size, actions = self.config.batch_size, self.size, self.actions
         shapes = (count, size), (count, actions), (count,), (count,), (count, size)
         normals = (self.draws, count, actions)
-        blank = self._on_device(*(np.zeros(shape) for shape in (*shapes, normals)))
+        blank = self._batch(*(torch.zeros(shape).to(self.place) for shape in (*shapes, normals)))
         for moves in (True, False)[: self.delay]:
             yield replace(blank, acts=moves)
 
-    def _on_device(self, *arrays: Array) -> Batch:
-        return Batch(*map(self.tensor, arrays), acts=self.updates % self.delay == 0)
+    def _batch(self, *parts: Tensor) -> Batch:
+        return Batch(*parts, acts=self.updates % self.delay == 0)
+
+    def _rows(self, seen: Mapping[str, Tensor]) -> Tensor:
+        """(B, F) as networks see them."""
+        count = self.config.batch_size
+        parts = [seen[name].reshape(count, -1) for name in self._inputs.names]
+        rows: Tensor = normalised(torch.cat(parts, dim=1), self._mean, self._scale)
+        return rows
+
+    def _settle(self) -> None:
+        """Send the statistics to the device."""
+        self._mean = self.tensor(self._normaliser.mean)
+        self._scale = self.tensor(self._normaliser.scale)
 
     def broadcast(self) -> Tensors:
         """The policy, and the statistics of what it sees."""
@@ -186,3 +206,4 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         """Take over networks and statistics."""
         super().load_networks(state)
         self._normaliser.load_state(under("seen.", state))
+        self._settle()

@@ -4,6 +4,7 @@ Legend: B rows, E episodes, T steps of an episode, F entries of a row.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +21,14 @@ class Inputs:
 
     Attributes:
         size: F.
+        names: of these fields, in order.
     """
 
     def __init__(self, spec: EpisodeSpec) -> None:
         """Take all fields that are observed; `check` those of a task first."""
         fields = sorted(spec.fields, key=lambda field: field.per == "episode")
         self._spec, self._fields = spec, [field for field in fields if field.per != "step"]
+        self.names = tuple(field.name for field in self._fields)
         self.size = sum(int(np.prod(field.shape)) for field in self._fields)
 
     @staticmethod
@@ -41,7 +44,7 @@ class Inputs:
     def rows(self, seen: Arrays) -> Singles:
         """(B, F) of fields with B rows each."""
         count = len(seen[self._spec.achieved])
-        parts = [seen[field.name].reshape(count, -1) for field in self._fields]
+        parts = [seen[name].reshape(count, -1) for name in self.names]
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
     def of_episodes(self, episodes: Episodes) -> Singles:
@@ -65,7 +68,7 @@ class Normaliser:
 
     Attributes:
         size: F.
-        mean, scale: (F,) float32, by which rows are normalised: `Actor` gets the same.
+        mean, scale: (F,) float32, by which `normalised` goes, in workers as in the master.
     """
 
     def __init__(self, size: int) -> None:
@@ -82,10 +85,6 @@ class Normaliser:
         self._mean += apart * (count / whole)
         self._count = whole
         self._settle()
-
-    def __call__(self, rows: Singles) -> Singles:
-        """Rows (B, F) of mean 0 and deviation 1, within +-5."""
-        return normalised(rows, self.mean, self.scale)
 
     def state(self) -> dict[str, Array]:
         """All of it, for a checkpoint."""
@@ -125,7 +124,6 @@ class Normaliser:
         self.scale: Singles = np.maximum(deviation, LEAST).astype(np.float32)
 
 
-def normalised(rows: Singles, mean: Singles, scale: Singles) -> Singles:
-    """Rows (B, F) as networks see them."""
-    clipped: Singles = np.clip((rows - mean) / scale, -FURTHEST, FURTHEST)
-    return clipped
+def normalised(rows: Any, mean: Any, scale: Any) -> Any:
+    """Rows (B, F), arrays or tensors, as networks see them: of mean 0, deviation 1, within +-5."""
+    return ((rows - mean) / scale).clip(-FURTHEST, FURTHEST)

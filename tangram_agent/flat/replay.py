@@ -7,13 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from tangram_agent.base.ring import Column, Ring
 from tangram_agent.flat.config import BaseConfig
 from tangram_core.agent import Streams
 from tangram_core.arrays import Bools, Ints, Singles
-from tangram_core.spec import Array, Arrays, Episodes
+from tangram_core.spec import ACTIONS, Array, Episodes
 from tangram_core.task import Task
+
+CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,33 +25,46 @@ class Transitions:
     """What a batch is made of.
 
     Attributes:
-        before, after: fields of the moment and of the episode, B rows each.
-        actions: (B, A).
-        rewards: (B,) for the goal that stands in both.
-        terminated: (B,) for that goal.
+        rows, steps: (B,) of which episode, by its slot, and which step of it.
+        desired: (B, ...) the goals.
+        rewards: (B,) for these.
+        terminated: (B,) for these.
     """
 
-    before: Arrays
-    after: Arrays
-    actions: Singles
+    rows: Ints
+    steps: Ints
+    desired: Array
     rewards: Singles
     terminated: Bools
 
 
 class EpisodeReplay(Ring):
-    """The newest episodes."""
+    """The newest episodes, on the processor and where it is learned from them."""
 
-    def __init__(self, task: Task, transitions: int) -> None:
+    def __init__(self, task: Task, transitions: int, place: torch.device = CPU) -> None:
         """Room for as many whole episodes as so many transitions make, and for one at least."""
-        self._task, self._spec = task, task.spec
+        self._task, self._spec, self._place = task, task.spec, place
         room = self._spec.empty(max(1, transitions // self._spec.horizon))
         every = self._spec.every
         super().__init__({f.name: Column(room[f.name], f.low, f.high) for f in every})
         self._moved = np.zeros(self.capacity, bool)
+        goal = self._spec.desired  # comes with each batch
+        self._seen = [f for f in self._spec.fields if f.per != "step" and f.name != goal]
+        names = [*(field.name for field in self._seen), ACTIONS]
+        # On the processor these are the arrays themselves.
+        self._held = {name: torch.from_numpy(self.arrays[name]).to(place) for name in names}
 
     def add(self, episodes: Episodes) -> None:
         """Append episodes; the oldest make room."""
-        self._look(self.append(episodes.arrays))
+        self._took(self.append(episodes.arrays))
+
+    def _took(self, slots: Ints) -> None:
+        """Send what is new to where it is learned from, and note which episodes moved."""
+        if self._place.type != "cpu":
+            where = torch.from_numpy(slots).to(self._place)
+            for name, held in self._held.items():
+                held[where] = torch.from_numpy(self.arrays[name][slots]).to(self._place)
+        self._look(slots)
 
     def _look(self, slots: Ints) -> None:
         """Note which episodes came to what would not have been reached at their start."""
@@ -71,17 +88,31 @@ class EpisodeReplay(Ring):
         moments = later(steps, spec.horizon, config.goals, rng["hindsight"])
         desired = arrays[spec.desired][rows]
         desired[other] = arrays[spec.achieved][rows[other], moments[other]]
-        before, after = self._seen(rows, steps, desired), self._seen(rows, steps + 1, desired)
         recorded = arrays["terminated"][rows, steps].astype(bool)
-        achieved = after[spec.achieved]
+        achieved = arrays[spec.achieved][rows, steps + 1]
         rewards = task.rewards(achieved, desired)
         return Transitions(
-            before,
-            after,
-            arrays["actions"][rows, steps],
+            rows,
+            steps,
+            desired,
             np.where(other, rewards, arrays["rewards"][rows, steps]).astype(np.float32),
             np.where(other, task.ended(achieved, desired, recorded), recorded),
         )
+
+    def seen(self, rows: Tensor, moments: Tensor, desired: Tensor) -> dict[str, Tensor]:
+        """What was seen in episodes (B,) at moments (B,), with goals (B, ...); B rows each."""
+        where = rows * (self._spec.horizon + 1) + moments
+        seen = {self._spec.desired: desired}
+        for field in self._seen:
+            held, moment = self._held[field.name], field.per == "moment"
+            kept = held.flatten(0, 1) if moment else held
+            seen[field.name] = kept.index_select(0, where if moment else rows)
+        return seen
+
+    def actions(self, rows: Tensor, steps: Tensor) -> Tensor:
+        """(B, A) what was done in episodes (B,) at steps (B,)."""
+        where = rows * self._spec.horizon + steps
+        return self._held[ACTIONS].flatten(0, 1).index_select(0, where)
 
     def _chosen(self, config: BaseConfig, rng: np.random.Generator) -> Ints:
         """(B,) episodes, by their slots; some of those that moved, where there are such.
@@ -95,22 +126,11 @@ class EpisodeReplay(Ring):
             rows[own] = moved[rng.integers(len(moved), size=own.sum())]
         return rows
 
-    def _seen(self, rows: Ints, moments: Ints, desired: Array) -> Arrays:
-        """What was seen at these moments, with these goals."""
-        seen = {
-            field.name: self.arrays[field.name][rows, moments]
-            if field.per == "moment"
-            else self.arrays[field.name][rows]
-            for field in self._spec.fields
-            if field.per != "step"
-        }
-        return seen | {self._spec.desired: desired}
-
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over a state, see `Ring`."""
         super().load_state(state)
         self._moved[:] = False
-        self._look(self._slots())
+        self._took(self._slots())
 
 
 def later(steps: Ints, horizon: int, goals: tuple[str, ...], rng: np.random.Generator) -> Ints:

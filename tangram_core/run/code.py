@@ -9,7 +9,7 @@ import re
 import shlex
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
@@ -17,9 +17,8 @@ from typing import Any
 
 from tangram_core.errors import ConfigError
 
-MODULES = "task.imports"
-# Argument -> section and setting that may hold path/to/file.py:Name.
-NAMES = {"task": ("task", "kind"), "agent": ("agent", "kind"), "reward.name": ("reward", "name")}
+IMPORTS = "imports"  # setting of any section: modules to import
+KIND = "kind"  # setting of a section that names what it is of: task.kind is given as task
 KNOWN = ("gymnasium_robotics", "panda_gym")  # modules of the extra `robotics`
 PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
 
@@ -39,7 +38,7 @@ def own_code(name: str) -> tuple[Path, str] | None:
 
 def override(name: str, value: str) -> str:
     """A setting whose value may hold anything, such as a path with blanks or `=`, for hydra."""
-    if name == MODULES:  # a list, and it stays one
+    if names_modules(name):  # a list, and it stays one
         return f"{name}={value}"
     escaped = value.replace("'", "\\'")
     return f"{name}='{escaped}'"
@@ -58,24 +57,24 @@ def unquoted(value: str) -> str:
 
 
 def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:
-    """The settings of a run that are code, which each of its commands must name itself."""
-    found = {name: value for name, value in _values(resolved) if own_code(value) is not None}
-    modules = _read(resolved, *MODULES.split("."))
-    if isinstance(modules, list | tuple) and not set(modules) <= {*KNOWN}:
-        found[MODULES] = f"[{','.join(map(str, modules))}]"
+    """The settings of a run that are code, which each of its commands must name itself.
+
+    These are the values path/to/file.py:Name, and lists of modules.
+    """
+    found = dict[str, str]()
+    for section, content in resolved.items():
+        for key, value in content.items() if isinstance(content, Mapping) else ():
+            name = section if key == KIND else f"{section}.{key}"
+            if isinstance(value, str) and own_code(value) is not None:
+                found[name] = value
+            elif names_modules(name) and isinstance(value, list | tuple) and {*value} - {*KNOWN}:
+                found[name] = f"[{','.join(map(str, value))}]"
     return found
 
 
-def _values(resolved: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    for name, place in NAMES.items():
-        value = _read(resolved, *place)
-        if isinstance(value, str):
-            yield name, value
-
-
-def _read(resolved: Mapping[str, Any], section: str, key: str) -> object:
-    content = resolved.get(section)
-    return content.get(key) if isinstance(content, Mapping) else None
+def names_modules(name: str) -> bool:
+    """Whether a setting is a list of modules to import."""
+    return name.endswith(f".{IMPORTS}")
 
 
 def name_modules(modules: str) -> None:
@@ -83,8 +82,8 @@ def name_modules(modules: str) -> None:
     _named.update(one.strip() for one in modules.strip("[]").split(","))
 
 
-def check_module(module: str) -> None:
-    """Refuse a module that nobody named, or has imported.
+def check_module(setting: str, module: str) -> None:
+    """Refuse a module that a setting names, and nobody named here or has imported.
 
     Raises:
         ConfigError: says what to add.
@@ -92,7 +91,7 @@ def check_module(module: str) -> None:
     if module not in {*KNOWN, *_named, *sys.modules}:
         raise ConfigError(
             f"the settings of the run name code, the module {module}, which is not imported unless "
-            f"you name it: add {MODULES}=[{module}] if you trust it"
+            f"you name it: add {setting}=[{module}] if you trust it"
         )
 
 
@@ -109,6 +108,8 @@ def read_code(setting: str, given: str, path: Path, sha256: str | None = None) -
         ConfigError: it cannot be read, or has another content.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise OSError(0, "it is no file")  # a pipe would be waited for
         source = path.read_bytes()
     except OSError as error:
         raise ConfigError(

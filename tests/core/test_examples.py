@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tangram_core.conformance import play
-from tangram_core.seeding import episode_generator
+from tangram_core.seeding import episode_generator, evaluation_generators
 from tests.core.examples import example
 
 pytestmark = pytest.mark.slow
@@ -23,5 +23,6 @@ def test_the_agent_of_the_examples_learns_their_task() -> None:
         for _ in range(20 if number > 3 else 0):
             learner.update(0.0, rng)
         actor.load(learner.broadcast())
-    tests = play(task, task.make(50), task.tests(50), lambda seen, past, _: actor.act(seen, past))
+    own = evaluation_generators(50)
+    tests = play(task, task.make(50), own, lambda seen, past, _: actor.act(seen, past))
     assert task.score(tests)["success"] >= 0.9

@@ -113,6 +113,11 @@ for name, kind, more in (
     ("Pictures-v0", Toy, {"observation_space": PICTURE}),
     ("Discrete-v0", Toy, {"action_space": spaces.Discrete(3)}),
     ("Unbounded-v0", Toy, {"action_space": spaces.Box(-np.inf, np.inf, (2,))}),
+    # What lies outside ends, told of rows, of one row, and of whether any of them does.
+    ("Rows-v0", Toy, {"compute_terminated": lambda a, *_: (np.abs(a) > 1).any(-1)}),
+    ("Row-v0", Toy, {"compute_terminated": lambda a, *_: abs(a[0]) > 1 or abs(a[1]) > 1}),
+    ("Any-v0", Toy, {"compute_terminated": lambda a, *_: bool((np.abs(a) > 1).any())}),
+    ("Never-v0", Toy, {"compute_terminated": lambda *_: False}),
 ):
     gymnasium.register(name, kind, max_episode_steps=HORIZON, kwargs=more)
 gymnasium.register("Endless-v0", Toy)

@@ -67,6 +67,13 @@ def test_what_terminates_plays_on_and_is_marked() -> None:
     assert (again.episodes.rewards == played.episodes.rewards).all()
 
 
+@pytest.mark.parametrize("name", ["Rows", "Row", "Any", "Never"])
+def test_what_terminates_by_a_function_of_goals_is_asked_for_each_row(name: str) -> None:
+    places = np.array([[0, 0], [0, 3], [0.5, 0]])
+    ended = Gym(replace(TOY, id=f"{name}-v0")).ended(places, places, np.zeros(3, bool))
+    assert ended.tolist() == [False, name != "Never", False]
+
+
 def test_scores_count_up_to_the_first_end() -> None:
     """Two episodes of four steps: one ends in its second, one is there for a while and leaves."""
     episodes = Episodes(

@@ -57,6 +57,7 @@ class PairGraph(nn.Module):
 
     tokens = 1  # in view
     body: Tensor
+    full_scale: Tensor
     symmetry: Tensor
     radius: Tensor
     area: Tensor
@@ -68,12 +69,12 @@ class PairGraph(nn.Module):
 
     def __init__(self, layout: Layout, arena: float) -> None:
         super().__init__()
-        self._full_scale = arena, arena, math.pi
         self.corners = int(layout.padded_corners.shape[1])
         self.nodes = 2 * self.corners + 1
         self.features = 9 + _ANGLES + 2 * _KINDS
         self.inputs = 2 * (1 + 2 * self.corners) + _ANGLES + 2 * _KINDS + 4
         constants = {
+            "full_scale": torch.tensor([arena, arena, math.pi]),
             "body": torch.as_tensor(layout.body[layout.padded_corners], dtype=torch.float32),
             "symmetry": torch.tensor([float(shape.symmetry) for shape in layout.shapes]),
             "radius": torch.tensor([shape.radius for shape in layout.shapes]).float(),
@@ -115,13 +116,13 @@ class PairGraph(nn.Module):
 
     def moved(self, pairs: Pairs, velocity: Tensor) -> Pairs:
         """The pairs after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
-        return pairs.at(pairs.pose + velocity * velocity.new_tensor(self._full_scale))
+        return pairs.at(pairs.pose + velocity * self.full_scale)
 
     def way(self, pairs: Pairs, to: Tensor) -> Tensor:
         """The velocity (M, 3) that takes tokens to poses (M, 3), by the shorter turn."""
         way = to - pairs.pose
         turned = torch.remainder(way[:, 2:] + math.pi, 2.0 * math.pi) - math.pi
-        return torch.cat([way[:, :2], turned], dim=-1) / way.new_tensor(self._full_scale)
+        return torch.cat([way[:, :2], turned], dim=-1) / self.full_scale
 
     def vectors(self, pairs: Pairs) -> Tensor:
         """(M, inputs): a pair in one row, without nodes."""

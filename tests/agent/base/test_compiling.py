@@ -3,20 +3,17 @@
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from master.config import COMPILERS, MasterConfig, check_compiling
+from master.config import COMPILERS, check_compiling
 from master.learn.trainer import Trainer
-from master.record.rundir import RunFolder
-from master.run import _make_trainer
-from tangram_agent.base.compiling import Compiled, cache_folder
+from tangram_agent.base.compiling import Whole, cache_folder
 from tangram_agent.base.learning import Rates
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.run.process import Watchdog
 from tangram_core.run.service import ServiceConfig
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.base.test_ddpg import CASES, changed, copied, play
@@ -91,20 +88,6 @@ def test_a_gpu_updates_as_a_processor_does(case: tuple[str, str], compiled: bool
     np.testing.assert_allclose(*map(_values, numbers), rtol=2e-3, atol=2e-5)
 
 
-@pytest.mark.fast
-def test_who_has_a_gpu_is_told_to_compile(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr("master.run.Trainer", lambda made, *_, **__: Trainer(made, 0, "cpu"))
-    caplog.set_level("INFO")
-    config, nobody = MasterConfig(run_dir=str(tmp_path)), cast(Watchdog, None)
-    for device, told in (("cpu", 0), ("cuda", 1)):
-        monkeypatch.setattr("master.run.choose_device", lambda _, found=device: found)
-        _make_trainer(config, CASES["ddpg", "paper"](), RunFolder(tmp_path), nobody)
-        assert len(caplog.messages) == told
-    assert "service.compile=true" in caplog.messages[0]
-
-
 def _values(numbers: list[Any]) -> list[list[float]]:
     return [list(one.values()) for one in numbers]
 
@@ -124,7 +107,7 @@ def test_a_graph_goes_on_with_what_was_restored(traced: list[Any]) -> None:
 
 @dataclass(frozen=True)
 class Rows:
-    """What `Compiled` takes, the smallest."""
+    """What `Whole` takes, the smallest."""
 
     own: torch.Tensor
 
@@ -133,7 +116,7 @@ class Rows:
 def test_what_lies_otherwise_in_memory_is_compiled_anew(traced: list[Any]) -> None:
     """Compiled code takes its arguments as they lay when it was made."""
     total = torch.zeros(())
-    whole = Compiled(lambda rows, _: total.add_(rows.own[0].sum()), [total])
+    whole = Whole(lambda rows, _: total.add_(rows.own[0].sum()), [total], compiled=True)
     rows = torch.arange(4.0).reshape(2, 2)
     for own, graphs in ((rows, 1), (rows.clone(), 1), (rows.T, 2)):
         whole(Rows(own), Rates(0.0, 0.0, 0.0))

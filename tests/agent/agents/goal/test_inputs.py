@@ -1,11 +1,14 @@
 """Rows of numbers: which fields they have, and their statistics."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_agent.flat.inputs import FURTHEST, LEAST, Inputs, Normaliser
+from tangram_agent.flat.inputs import FURTHEST, LEAST, Inputs, Normaliser, normalised
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.spec import EpisodeSpec, Field
 
@@ -64,9 +67,16 @@ def test_statistics_of_parts_are_those_of_the_whole(sizes: list[int], seed: int)
 
 def test_what_is_far_or_constant_stays_within_bounds() -> None:
     normaliser = Normaliser(2)
-    assert normaliser(np.array([[0.5, 9]], "f4")).tolist() == [[0.5, FURTHEST]]
+
+    def seen(*rows: tuple[float, float]) -> Any:
+        arrays = np.array(rows, "f4"), normaliser.mean, normaliser.scale
+        found = normalised(*arrays)
+        assert (normalised(*map(torch.from_numpy, arrays)).numpy() == found).all()
+        return found.tolist()
+
+    assert seen((0.5, 9)) == [[0.5, FURTHEST]]
     normaliser.add(np.array([[1, 7], [3, 7]], "f4"))
-    assert normaliser(np.array([[3, 7], [1e6, 8]], "f4")).tolist() == [[1, 0], [FURTHEST, FURTHEST]]
+    assert seen((3, 7), (1e6, 8)) == [[1, 0], [FURTHEST, FURTHEST]]
 
 
 @pytest.mark.parametrize(

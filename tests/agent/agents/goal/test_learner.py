@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from tangram_agent.agents.goal.agent import Goal, GoalConfig
 from tangram_agent.agents.goal.gaussian import GaussianPolicy
+from tangram_agent.agents.goal.learner import GoalLearner
+from tangram_agent.base.compiling import Whole
 from tangram_agent.flat.actor_critic import ActorCritic, Batch, Loss
 from tangram_core.agent import NotFiniteError
 from tangram_core.errors import ConfigError
@@ -23,10 +25,12 @@ TASK = Line()
 SMALL = GoalConfig(hidden=(8,), batch_size=16, learning_starts=4, replay_capacity=100)
 
 
-def learner(config: GoalConfig = SMALL, kind: type[ActorCritic[Any]] | None = None) -> Any:
+def learner(
+    config: GoalConfig = SMALL, kind: type[ActorCritic[Any]] | None = None, device: str = "cpu"
+) -> Any:
     """With four random episodes."""
     agent = Goal(config)
-    made: Any = (kind or agent.learns())(agent, TASK, 0)
+    made: Any = (kind or agent.learns())(agent, TASK, 0, device)
     rng, episodes = np.random.default_rng(0), TASK.spec.empty(4)
     for name in ("place", "goal", "actions"):
         episodes[name][:] = rng.uniform(-1, 1, episodes[name].shape)
@@ -187,3 +191,29 @@ def test_other_settings_are_other_agents() -> None:
     same, other = Goal(replace(SMALL)), Goal(replace(SMALL, gamma=0.5))
     assert Goal(SMALL).identity() == same.identity()
     assert Goal(SMALL).identity() != other.identity()
+
+
+class Fading(GoalLearner):
+    """What its losses are hangs on how many updates were made."""
+
+    def losses(self, batch: Batch) -> Iterator[Loss]:
+        for loss in super().losses(batch):
+            yield replace(loss, value=loss.value / (1 + self.updates))
+
+
+def test_losses_that_change_without_their_batch_are_refused_for_graphs() -> None:
+    steady, fading = learner(), learner(kind=Fading)
+    for made in (steady, fading):
+        made._whole = Whole(made.step, [p for own in made.lists.values() for p in own], False)
+    steady.prepare()
+    with pytest.raises(ConfigError, match=r"Fading.losses: wanted the same.*compiles = False"):
+        fading.prepare()
+
+
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac"])
+def test_drawing_and_an_update_stay_on_their_device(algorithm: str) -> None:
+    """On torch's `meta` device, which has no values: see tests/agent/base/test_devices.py."""
+    made = learner(replace(SMALL, algorithm=algorithm), device="meta")
+    batch = made.drawn(streams(made))
+    assert {one.device.type for one in vars(batch).values() if isinstance(one, Tensor)} == {"meta"}
+    assert made._whole(batch, made.rates(0.0)).device.type == "meta"

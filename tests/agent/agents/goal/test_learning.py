@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import tests.core.toy  # noqa: F401 - registers environments
 from tangram_agent.agents.goal.agent import Goal, GoalConfig
 from tangram_core.conformance import play
 from tangram_core.seeding import episode_generator

@@ -1,14 +1,16 @@
 """The replay of whole episodes: which are kept, and which goals take the desired one's place."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tangram_agent.flat.config import BaseConfig
-from tangram_agent.flat.replay import EpisodeReplay, later
+from tangram_agent.flat.replay import EpisodeReplay, Transitions, later
 from tangram_core.agent import Streams
+from tangram_core.arrays import Singles
 from tangram_core.errors import RunError
 from tangram_core.spec import Episodes
 from tests.agent.agents.goal.worlds import Line
@@ -43,9 +45,29 @@ def replay(capacity: int, *batches: Episodes) -> EpisodeReplay:
     return made
 
 
+@dataclass
+class Found:
+    """A batch as `Transitions` names it: places before and after, goals, and all the rest."""
+
+    before: Singles
+    after: Singles
+    goal: Singles
+    actions: Singles
+    rest: Transitions
+
+
+def sample(kept: EpisodeReplay, config: BaseConfig = CONFIG, seed: int = 0) -> Found:
+    rest = kept.sample(config, streams(seed))
+    rows, steps, goals = map(torch.from_numpy, (rest.rows, rest.steps, rest.desired))
+    before, after = (kept.seen(rows, moments, goals) for moments in (steps, steps + 1))
+    assert before["goal"] is after["goal"] is goals
+    places = (seen["place"][:, 0].numpy() for seen in (before, after))
+    actions = kept.actions(rows, steps)[:, 0].numpy()
+    return Found(*places, rest.desired[:, 0], actions, rest)
+
+
 def numbers(kept: EpisodeReplay) -> set[int]:
-    found = kept.sample(CONFIG, streams())
-    return set((found.before["place"][:, 0] // 100).astype(int).tolist())
+    return set((sample(kept).before // 100).astype(int).tolist())
 
 
 def test_the_newest_episodes_are_kept() -> None:
@@ -56,25 +78,23 @@ def test_the_newest_episodes_are_kept() -> None:
 
 
 def test_a_batch_has_what_followed_and_what_it_was_worth() -> None:
-    found = replay(100, episodes(1, 2, 3)).sample(CONFIG, streams())
-    before, after = found.before["place"][:, 0], found.after["place"][:, 0]
+    found = sample(replay(100, episodes(1, 2, 3)))
+    before, after, goal = found.before, found.after, found.goal
     assert (after == before + 1).all()
-    assert found.actions[:, 0] == pytest.approx((before % 100) / 10)
-    goal = found.before["goal"][:, 0]
-    assert (found.after["goal"][:, 0] == goal).all()
+    assert found.actions == pytest.approx((before % 100) / 10)
     relabelled = goal != -1
     assert 0.4 < relabelled.mean() < 0.6
     assert (goal[relabelled] >= after[relabelled]).all()  # of this episode, and of a later moment
     assert (goal[relabelled] < before[relabelled] + 5).all()
-    assert (found.rewards == np.where(goal == after, 0, -1)).all()
-    assert (found.terminated == (goal == after)).all()
+    assert (found.rest.rewards == np.where(goal == after, 0, -1)).all()
+    assert (found.rest.terminated == (goal == after)).all()
 
 
 def test_without_hindsight_all_is_as_it_was_played() -> None:
-    found = replay(100, episodes(1, 2)).sample(replace(CONFIG, relabel_share=0.0), streams())
-    assert (found.before["goal"] == -1).all()
-    assert (found.rewards == -1).all()
-    assert not found.terminated.any()
+    found = sample(replay(100, episodes(1, 2)), replace(CONFIG, relabel_share=0.0))
+    assert (found.goal == -1).all()
+    assert (found.rest.rewards == -1).all()
+    assert not found.rest.terminated.any()
 
 
 @pytest.mark.parametrize(
@@ -99,10 +119,10 @@ def test_several_kinds_are_as_often() -> None:
 
 def test_a_share_comes_of_episodes_that_moved() -> None:
     kept = replay(1000, episodes(*range(1, 10), moves=False), episodes(10))
-    found = kept.sample(replace(CONFIG, moved_share=0.5), streams())
-    assert 0.45 < (found.before["place"][:, 0] >= 1000).mean() < 0.65
+    found = sample(kept, replace(CONFIG, moved_share=0.5))
+    assert 0.45 < (found.before >= 1000).mean() < 0.65
     still = replay(1000, episodes(1, 2, moves=False))  # none moved: any will do
-    assert len(still.sample(replace(CONFIG, moved_share=0.5), streams()).rewards) == 400
+    assert len(sample(still, replace(CONFIG, moved_share=0.5)).before) == 400
 
 
 @pytest.mark.parametrize("added", [2, 3, 7])
@@ -112,9 +132,9 @@ def test_a_replay_goes_on_from_its_state(added: int) -> None:
     other.load_state(kept.state())
     for one in (kept, other):
         one.add(episodes(99))
-    first, second = (one.sample(CONFIG, streams(5)) for one in (kept, other))
-    assert (first.before["place"] == second.before["place"]).all()
-    assert (first.before["goal"] == second.before["goal"]).all()
+    first, second = (sample(one, seed=5) for one in (kept, other))
+    assert (first.before == second.before).all()
+    assert (first.goal == second.goal).all()
 
 
 @pytest.mark.parametrize("capacity", [2, 3, 5])

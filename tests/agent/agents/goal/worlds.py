@@ -18,7 +18,11 @@ class Line(Task):
     spec = EpisodeSpec(
         4,
         1,
-        (Field("place", (1,), -1e4, 1e4), Field("goal", (1,), -1e4, 1e4, "episode")),
+        (
+            Field("place", (1,), -1e4, 1e4),
+            Field("time", (), 0, 4),
+            Field("goal", (1,), -1e4, 1e4, "episode"),
+        ),
         achieved="place",
         desired="goal",
         rewards=(-1.0, 0.0),
