@@ -24,10 +24,10 @@ examples:
 """
 RATES = {
     "wire": "worker to master, against bare ROUTER-DEALER sockets",
-    "learner": "updates, compiled or not, against Stable-Baselines3",
+    "learner": "updates, compiled, against single operations",
     "goals": "a goal environment learned, against Stable-Baselines3 (id=, minutes=)",
     "scaling": "more workers, and 64 synthetic ones",
-    "gpu": "updates on a GPU, against single operations there and one core",
+    "gpu": "updates on a GPU, recorded, against single operations there, compiled ones and one core",
 }
 TRIALS = {
     "chaos": "random faults over a real training",

@@ -37,11 +37,6 @@ def several(count: int) -> Setup:
     return replace(setup, task=replace(place(setup), tokens=TokensConfig(SEVEN[:count], 0.6)))
 
 
-def with_sim(setup: Setup, **values: Any) -> Setup:
-    """Another simulation."""
-    return replace(setup, task=place(setup).with_sim(**values))
-
-
 def with_agent(setup: Setup, **values: Any) -> Setup:
     """Another agent."""
     agent: Any = setup.agent

@@ -1,4 +1,4 @@
 """Rates, each measured in turns with something else: wire, learner, whole trainings.
 
-Start with `learner.py`. `goals.py` trains beside Stable-Baselines3; `sb3.py` makes its DDPG.
+Start with `learner.py`. `goals.py` trains beside Stable-Baselines3.
 """

@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,9 @@ import torch
 
 from tangram_core.errors import TangramError
 from tangram_lab.benchmarks.measure import Row, told
-from tangram_lab.benchmarks.speed.sb3 import LIBRARY, label
 from tangram_lab.benchmarks.trainings import start_training
 
-STAGE = "goals"
+STAGE, LIBRARY = "goals", "stable_baselines3"
 TESTS = 50
 LOOK_S = 60.0  # between two tests
 GOOD = 0.9
@@ -32,6 +32,17 @@ ENVS = 4
 BATCH, HIDDEN, NOISE = 512, (256, 256), 0.2
 # Seconds of training, steps of the environment, updates, share of tests that succeed.
 Curve = list[tuple[float, int, int, float]]
+
+
+def label() -> str:
+    """The library's name and version; ModuleNotFoundError where it is missing."""
+    try:
+        return f"Stable-Baselines3 {version('stable-baselines3')}"
+    except PackageNotFoundError:
+        raise ModuleNotFoundError(
+            "Stable-Baselines3, which this compares with, is missing: "
+            "pip install 'tangram-rl[peers]'"
+        ) from None
 
 
 def measure_goals(id: str, minutes: float) -> list[Row]:  # noqa: A002 - as gymnasium calls it

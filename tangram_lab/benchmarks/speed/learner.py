@@ -1,8 +1,7 @@
-"""Updates: compiled, on a GPU, and against Stable-Baselines3's on the same perceptron."""
+"""Updates: compiled, and on a GPU."""
 
-from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -10,23 +9,16 @@ import torch
 from tangram_agent.agents.pair.batch import make_pairs
 from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.base.ddpg import Ddpg
-from tangram_agent.base.types import Transitions
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates
-from tangram_lab.benchmarks.setups import preset, random_transitions, several, with_agent, with_sim
-from tangram_lab.benchmarks.speed.sb3 import label, make_model
+from tangram_lab.benchmarks.setups import preset, random_transitions, several, with_agent
 
 BATCHES = (64, 256)
 
 
 def measure_learner(runs: int) -> list[Row]:
-    """Updates per second on one core: compiled, and beside Stable-Baselines3's."""
-    return _compiled(runs) + _beside_theirs(runs)
-
-
-def _compiled(runs: int) -> list[Row]:
-    """`service.compile=true` against single operations, which compute the same."""
+    """Updates per second on one core, compiled, against single operations that do the same."""
     cases = [("perceptron [64, 64]", preset("mlp"), 256, 2.3)]
     cases += [("ours", preset(), size, 1.5) for size in BATCHES]
     cases += [("ours, 7 tokens", several(7), BATCHES[0], 1.5)]
@@ -92,62 +84,3 @@ def updates(setup: Setup, made: Ddpg | None = None) -> Work:
         return 1
 
     return work
-
-
-# Against Stable-Baselines3
-
-
-BATCH, FILLED, STEPS = 256, 4096, 16
-
-
-def _beside_theirs(runs: int) -> list[Row]:
-    """Of the same perceptron: ours leaves out target networks that decide nothing.
-
-    Once every transition is final, and once every second one: theirs always asks its targets.
-    """
-    model = make_model(STEPS, BATCH, FILLED)
-    model.learn(FILLED)  # fills its replay with random play
-    setup, rows = with_agent(preset("mlp"), batch_size=BATCH), []
-    final, theirs = random_transitions(setup, BATCH), model.replay_buffer.sample(BATCH)
-    half = np.arange(BATCH, dtype=np.uint8) % 2
-    dones = theirs.dones.clone()
-    dones[::2] = 0.0
-    cases: list[tuple[str, Setup, Transitions, Any]] = [
-        ("every transition final", setup, final, theirs),
-        (
-            "half of them",
-            with_sim(setup, actions_per_token=2),
-            replace(final, done=half),
-            theirs._replace(dones=dones),
-        ),
-    ]
-    for compiled in (False, True):
-        for name, made, batch, drawn in cases:
-            how = f"{name}, compiled" if compiled else name
-            labels = "learner", f"perceptron [64, 64], batch {BATCH}, {how}", "updates/s"
-            bound = Bound(least=2.0 if compiled else 1.5) if name.startswith("every") else None
-            ours = _on_batch(learner(made, compiled=compiled), batch)
-            rows.append(compare(labels, ours, (label(), _theirs(model, drawn)), runs, bound))
-    return rows
-
-
-def _on_batch(own: Ddpg, batch: Transitions) -> Work:
-    generator = np.random.default_rng(0)
-
-    def update() -> float:
-        own.learn(own.steps(batch, generator))
-        return 1.0
-
-    return update
-
-
-def _theirs(model: Any, batch: Any) -> Work:
-    """As many updates in one call as environments step at a time, as in a training."""
-
-    def update() -> float:
-        drawn, model.replay_buffer.sample = model.replay_buffer.sample, lambda *_, **__: batch
-        model.train(gradient_steps=STEPS, batch_size=BATCH)
-        model.replay_buffer.sample = drawn
-        return float(STEPS)
-
-    return update
