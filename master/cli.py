@@ -79,7 +79,7 @@ def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
         return _made(settings, plays=plays)
     except TangramError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         own = ", ".join(f"{name}={value}" for name, value in code_of(settings).items())
         if not own:
             raise

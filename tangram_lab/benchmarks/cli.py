@@ -27,7 +27,7 @@ RATES = {
     "learner": "updates, compiled, against single operations",
     "goals": "a goal environment learned, against Stable-Baselines3 (id=, minutes=)",
     "scaling": "more workers, and 64 synthetic ones",
-    "gpu": "updates on a GPU, recorded, against single operations there, compiled ones and one core",
+    "gpu": "updates on a GPU, recorded, against other ways there and one core",
 }
 TRIALS = {
     "chaos": "random faults over a real training",

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 from contextlib import ExitStack
 from pathlib import Path
@@ -150,13 +151,20 @@ def test_a_file_that_holds_no_agent_is_told(
     assert remedy in told
 
 
-def test_a_promise_that_is_not_kept_is_told_before_anything_starts(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ("return -1.0 * (np.linalg", "return np.nan * (np.linalg", "Points.step"),
+        ("def make(", "def check(self, **_):\n        exit(3)\n\n    def make(", "SystemExit: 3"),
+    ],
+)
+def test_a_promise_that_is_not_kept_is_told_before_anything_starts(
+    tmp_path: Path, before: str, after: str, told: str
+) -> None:
     text = (EXAMPLES / "point.py").read_text()
-    rewards = "return -1.0 * (np.linalg.norm"
-    assert rewards in text
-    (tmp_path / "own.py").write_text(text.replace(rewards, "return np.nan * (np.linalg.norm"))
-    told = refused("tangram-train", "task=own.py:Point", "agent=goal", cwd=tmp_path)
-    assert "Points.step" in told
+    assert before in text
+    (tmp_path / "own.py").write_text(text.replace(before, after))
+    assert told in refused("tangram-train", "task=own.py:Point", "agent=goal", cwd=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["own.py"]
 
 
@@ -226,10 +234,12 @@ def test_a_file_that_changed_before_its_copy_is_refused(tmp_path: Path) -> None:
     [
         (["task=own.py"], "task=own.py: name the class in it, as in task=path/to/file.py:Name"),
         (["from_config=x.yaml", "--cfg", "job"], "--cfg shows presets and arguments alone"),
+        (["agent=pipe.py:A"], "it is no file"),
         (["agent=a.py:A,b.py:B"], "one file at a time: give a sweep for each"),
     ],
 )
 def test_what_cannot_be_meant_is_told(tmp_path: Path, arguments: list[str], told: str) -> None:
+    os.mkfifo(tmp_path / "pipe.py")
     assert told in refused("tangram-train", *arguments, cwd=tmp_path)
 
 
