@@ -28,7 +28,7 @@ from tangram_core.errors import RunError
 _CACHE_SETTING = "TORCHINDUCTOR_CACHE_DIR"
 _FLAGS = re.compile(rb"^(?:flags|Features)\s*:(.*)$", re.MULTILINE)
 # Of arguments and rates: as a graph takes them, and as it is called.
-Call = Callable[[list[Tensor], list[Tensor]], Tensor]
+Call = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
 Called = Callable[[list[Tensor], list[float]], Tensor]
 
 log = logging.getLogger(__name__)
@@ -74,10 +74,15 @@ class Whole:
         form = _form(steps, tensors, {})
         values = [float(rate) for rate in rates]
         if form not in self._graphs:
+            names, kind = [*map(id, tensors)], type(rates)
+
+            def call(given: Sequence[Tensor], rates: Sequence[Tensor]) -> Tensor:
+                own = dict(zip(names, given, strict=True))
+                return self._function(_with(steps, own, {}), kind(*rates))
+
             numbers = [torch.tensor(value, device=tensors[0].device) for value in values]
-            make = self._graph if self._compiled else self._single
-            call = make(steps, type(rates), tensors, numbers)
-            self._graphs[form] = self._recorded(call, tensors, numbers)
+            whole = self._built(call, tensors, numbers) if self._compiled else call
+            self._graphs[form] = self._recorded(whole, tensors, numbers)
         return self._graphs[form](tensors, values)
 
     def prepare(self, steps: Any, rates: tuple[float | Tensor, ...]) -> None:
@@ -109,21 +114,8 @@ class Whole:
                 for one, old in zip(self._changed, before, strict=True):
                     one.copy_(old)
 
-    def _single(
-        self, steps: Any, kind: Callable[..., Any], tensors: list[Tensor], _: list[Tensor]
-    ) -> Call:
-        """The function as it is."""
-
-        def call(given: list[Tensor], rates: list[Tensor]) -> Tensor:
-            own = dict(zip(map(id, tensors), given, strict=True))
-            return self._function(_with(steps, own, {}), kind(*rates))
-
-        return call
-
-    def _graph(
-        self, steps: Any, kind: Callable[..., Any], tensors: list[Tensor], numbers: list[Tensor]
-    ) -> Call:
-        """The function, compiled."""
+    def _built(self, function: Call, tensors: list[Tensor], numbers: list[Tensor]) -> Call:
+        """The same, compiled."""
         # Only here: the compiler takes seconds and 200 MB to load.
         from torch._inductor import standalone_compile  # noqa: PLC0415
         from torch.fx.experimental.proxy_tensor import make_fx  # noqa: PLC0415
@@ -131,8 +123,7 @@ class Whole:
         count = len(tensors)
 
         def flat(*given: Tensor) -> tuple[Tensor]:
-            own = dict(zip(map(id, tensors), given[:count], strict=True))
-            return (self._function(_with(steps, own, {}), kind(*given[count:])),)
+            return (function(given[:count], given[count:]),)
 
         with self.unchanged():  # it is traced by doing it once
             graph, constants = _lifted(make_fx(flat)(*tensors, *numbers))
@@ -154,7 +145,7 @@ class Whole:
             )
 
         @torch.no_grad()
-        def call(given: list[Tensor], rates: list[Tensor]) -> Tensor:
+        def call(given: Sequence[Tensor], rates: Sequence[Tensor]) -> Tensor:
             found: Tensor = compiled(*constants, *given, *rates)[0]
             return found
 
@@ -206,9 +197,8 @@ def _filled(call: Call) -> Called:
     """The same of rates as numbers."""
 
     def filled(tensors: list[Tensor], values: list[float]) -> Tensor:
-        return call(
-            tensors, [tensors[0].new_tensor(value, dtype=torch.float32) for value in values]
-        )
+        device = tensors[0].device
+        return call(tensors, [torch.tensor(value, device=device) for value in values])
 
     return filled
 
