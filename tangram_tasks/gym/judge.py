@@ -22,6 +22,7 @@ from tangram_tasks.gym.task import SUCCESS, GymConfig
 
 OBSERVATION, ACHIEVED, DESIRED = "observation", "achieved_goal", "desired_goal"
 MOST = 1e6  # of a number that is observed: only what is wrong lies beyond
+FAR = 1e3  # a goal that is reached by nobody
 TRIED = 10  # random steps by which an environment is looked at
 Environment = gymnasium.Env[Any, Any]
 
@@ -185,17 +186,17 @@ class Judge:
                 self._refuse(f"its info lacks {SUCCESS}, which its score is made of")
             achieved.append(seen[ACHIEVED])
             paid.append(float(reward))
-        A = np.concatenate([achieved, achieved, [desired]])
-        D = np.concatenate([[desired] * len(achieved), achieved[::-1], [desired]])
+        # The last rows lie where no play of a few steps comes to.
+        space, far = self._box(ACHIEVED), rng.choice([-FAR, FAR], (TRIED, len(desired)))
+        A = np.concatenate([[desired], achieved, achieved, far.clip(space.low, space.high)])
+        D = np.concatenate([[desired] * (1 + len(achieved)), achieved[::-1], [desired] * TRIED])
         found = self._whole(A, D)
-        if not np.allclose(found[1 : len(achieved)], paid, rtol=1e-4, atol=1e-6):
+        if not np.allclose(found[2 : 1 + len(achieved)], paid, rtol=1e-4, atol=1e-6):
             self._refuse("its steps do not pay what compute_reward says of the goals alone")
-        self._best = float(found[-1])
+        self._best = float(found[0])
         self._ended: Callable[[Array, Array], Bools] = self._at_best
         if self.env.has_wrapper_attr("compute_terminated"):
             self._terminated: Callable[..., Any] = self.env.get_wrapper_attr("compute_terminated")
-            far = np.where(rng.random(A.shape) < 0.5, -MOST, MOST)
-            A, D = np.concatenate([A, far]), np.concatenate([D, D])
             self._ended = self._at_once if self._takes_arrays(A, D) else self._one_by_one
         return found
 

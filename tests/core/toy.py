@@ -117,6 +117,7 @@ for name, kind, more in (
     ("Rows-v0", Toy, {"compute_terminated": lambda a, *_: (np.abs(a) > 1).any(-1)}),
     ("Row-v0", Toy, {"compute_terminated": lambda a, *_: abs(a[0]) > 1 or abs(a[1]) > 1}),
     ("Any-v0", Toy, {"compute_terminated": lambda a, *_: bool((np.abs(a) > 1).any())}),
+    ("Dear-v0", Toy, {"compute_reward": lambda a, *_: -5.0 * (np.abs(a) > 2).any(-1)}),
     ("Never-v0", Toy, {"compute_terminated": lambda *_: False}),
 ):
     gymnasium.register(name, kind, max_episode_steps=HORIZON, kwargs=more)

@@ -46,6 +46,8 @@ def test_the_spec_is_what_the_environment_says() -> None:
     ]
     assert (spec.action_size, spec.achieved, spec.desired) == (2, "achieved_goal", "desired_goal")
     assert spec.rewards == (-1.0, 0.0)  # all that its reward was seen to be
+    low, _ = Gym(replace(TOY, id="Dear-v0")).spec.rewards  # -5 far away
+    assert low < -5.0
 
 
 def test_an_action_covers_the_bounds_of_the_environment() -> None:
