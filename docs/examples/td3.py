@@ -3,7 +3,7 @@
 Replay, hindsight, normalised inputs, optimisers and checkpoints come with the base. Train it with:
 
     tangram-train agent=docs/examples/td3.py:TD3 task=gym task.id=PandaPush-v3 \
-        task.imports=[panda_gym] task.fresh=true service.envs=2
+        task.imports=[panda_gym] task.fresh=true
 """
 
 from dataclasses import dataclass

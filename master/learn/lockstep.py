@@ -35,8 +35,9 @@ class Lockstep:
         """
         if service.mode != "lockstep":
             return None
-        check_batch_size(spec, service.batch_episodes)
-        return Lockstep(workers, service.batch_episodes)
+        size = service.batch_episodes(spec.horizon)
+        check_batch_size(spec, size)
+        return Lockstep(workers, size)
 
     def begins_round(self, episodes: int) -> bool:
         """Whether, with so many episodes inserted, the next one is the first of a round."""

@@ -6,6 +6,7 @@ from tangram_core.run.process import FORMATS
 from tangram_core.settings import Settings, setting
 from tangram_core.wire.addresses import LOCAL, check_host
 
+MOST_ENVS, STEPS = 16, 128  # environments, and steps of theirs, that a worker plays at a time
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
 
@@ -56,10 +57,11 @@ class ServiceConfig(Settings, section="service"):
         only={"mode": "async"},
     )
     envs: int = setting(
-        16,
+        0,
         "environments that one worker plays at a time; a message holds two episodes of each, fewer "
-        "where they are too large for it",
-        low=1,
+        "where they are too large for it. 0: 16, fewer where episodes are longer than 8 steps, so "
+        "that new weights are waited for no longer",
+        low=0,
         high=512,
     )
     eval_seconds: float = setting(10.0, "least time between two evaluations", low=0, unit="s")
@@ -84,10 +86,13 @@ class ServiceConfig(Settings, section="service"):
         "any case",
     )
 
-    @property
-    def batch_episodes(self) -> int:
-        """Episodes in one message, where they are not too large for it."""
-        return 2 * self.envs
+    def envs_for(self, horizon: int) -> int:
+        """Environments in which one worker plays episodes of so many steps."""
+        return self.envs or min(MOST_ENVS, max(1, STEPS // horizon))
+
+    def batch_episodes(self, horizon: int) -> int:
+        """Episodes of so many steps in one message, where they are not too large for it."""
+        return 2 * self.envs_for(horizon)
 
     def __post_init__(self) -> None:
         super().__post_init__()

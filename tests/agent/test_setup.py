@@ -144,10 +144,20 @@ def test_sizes_follow_from_tokens_and_actions(
 
 
 @pytest.mark.parametrize(
+    ("envs", "horizon", "found"), [(0, 1, 16), (0, 8, 16), (0, 50, 2), (0, 999, 1), (5, 50, 5)]
+)
+def test_a_worker_plays_fewer_environments_the_longer_episodes_are(
+    envs: int, horizon: int, found: int
+) -> None:
+    service = ServiceConfig(envs=envs)
+    assert (service.envs_for(horizon), service.batch_episodes(horizon)) == (found, 2 * found)
+
+
+@pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
         ("port", 65535, "service.port must be between 0 and 65534, got 65535"),
-        ("envs", 0, "service.envs must be between 1 and 512, got 0"),
+        ("envs", -1, "service.envs must be between 0 and 512, got -1"),
         ("publish_seconds", -1.0, "service.publish_seconds must be at least 0, got -1"),
         ("eval_seconds", -1.0, "service.eval_seconds must be at least 0, got -1"),
         ("eval_episodes", 0, "service.eval_episodes must be between 1"),

@@ -25,9 +25,10 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     """
     acting, report = Acting(setup.agent.actor(setup.task)), Report()
     # What is too large for a message is split.
-    size = min(config.service.batch_episodes, most_episodes(setup.spec))
+    service, horizon = config.service, setup.spec.horizon
+    size = min(service.batch_episodes(horizon), most_episodes(setup.spec))
     with (
-        closing(setup.task.make(config.service.envs, "play")) as env,
+        closing(setup.task.make(service.envs_for(horizon), "play")) as env,
         joined(config, setup, acting.actor) as client,
     ):
         if client.stopped:

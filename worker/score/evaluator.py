@@ -61,7 +61,8 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
     """Score the newest weights until the master or a signal ends it; as `run_player`."""
     acting, service = Acting(setup.agent.actor(setup.task)), config.service
     schedule = Schedule(service.eval_seconds, max(STILL_S, 4.0 * service.publish_seconds))
-    tests = FixedTests(setup.task, service.eval_episodes, service.envs)
+    at_once = service.envs_for(setup.spec.horizon)
+    tests = FixedTests(setup.task, service.eval_episodes, at_once)
     with closing(tests), joined(config, setup, acting.actor) as client:
         while not client.stopped:
             client.poll(POLL_S)

@@ -100,7 +100,7 @@ def _ours(id: str, minutes: float, folder: Path, cores: list[int]) -> Curve:  # 
     """Our training, on its cores; workers and master take turns where there are fewer."""
     settings = (
         *("task=gym", f"task.id={id}", f"task.imports=[{module_of(id)}]", "agent=goal"),
-        *(f"workers={max(2, len(cores) - 1)}", "service.envs=2", "service.device=cpu"),
+        *(f"workers={max(2, len(cores) - 1)}", "service.device=cpu"),
         *(f"service.eval_seconds={LOOK_S}", f"service.eval_episodes={TESTS}"),
         *(f"max_hours={minutes / 60.0}", "max_updates=0"),
     )
