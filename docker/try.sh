@@ -96,6 +96,7 @@ export COMPOSE_PROJECT_NAME=tangram-try RUN=run
 export METRICS_PORT=19090 TENSORBOARD_PORT=16006
 export SETTINGS="max_updates=0 service.eval_seconds=3 service.checkpoint_minutes=0.2"
 export BASE=python:3.11-slim-bookworm
+trap 'echo "try.sh: ended by line $LINENO" >&2' ERR
 trap clean_up EXIT
 
 if ! docker info >/dev/null 2>&1; then
@@ -176,7 +177,7 @@ held "two workers and an evaluator join" eventually equals players 2.0
 held "the master learns" eventually above updates 20
 held "the mean reward rises by 0.5" eventually rose 0.5
 held "TensorBoard answers" eventually curl --fail --silent --output /dev/null "http://127.0.0.1:$TENSORBOARD_PORT"
-worker=$(compose ps --quiet worker | head -n 1)
+worker=$(compose ps --quiet worker | sed -n 1p)  # head would end the one before it, and all this
 held "a worker's container is healthy" eventually healthy "$worker"
 
 kill_inside "$worker"

@@ -11,7 +11,7 @@ submit() {
 }
 
 job_field() { # JOB NAME
-    scontrol show job "$1" 2>/dev/null | grep -oE "(^| )$2=[^ ]*" | head -n 1 | cut -d= -f2
+    scontrol show job "$1" 2>/dev/null | grep -oE "(^| )$2=[^ ]*" | sed -n 1p | cut -d= -f2
 }
 
 has_ended() { # JOB
