@@ -99,7 +99,6 @@ class Learner(ABC):
         parameters: numbers that are learned.
         device: where, for reports.
         capacity: transitions that are kept, or states, at most.
-        compiles: whether its updates can be made a graph, by a compiler or by a GPU.
     """
 
     streams: tuple[str, ...] = ("replay", "hindsight")
@@ -108,7 +107,6 @@ class Learner(ABC):
     parameters: int = 0
     device: str = "cpu"
     capacity: int = 0
-    compiles: bool = False
 
     @abstractmethod
     def insert(self, episodes: Episodes, rng: Streams) -> int:

@@ -69,6 +69,7 @@ class NetworkLearner(Learner):
     Attributes:
         polyak: rho of the target networks, Eq. 4.
         delay: the actor moves in every so manieth update.
+        compiles: whether its updates can be made a graph, by a compiler or by a GPU.
         replay: what it learns from.
         batch: of the last update, with `arrays`.
         targets: frozen copies of networks, by the names of these.

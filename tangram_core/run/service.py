@@ -6,7 +6,7 @@ from tangram_core.run.process import FORMATS
 from tangram_core.settings import Settings, setting
 from tangram_core.wire.addresses import LOCAL, check_host
 
-MOST_ENVS, STEPS = 16, 128  # environments, and steps of theirs, that a worker plays at a time
+MOST_ENVS, STEPS = 16, 128  # of service.envs=0: environments, and steps in all their episodes
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
 
@@ -59,8 +59,8 @@ class ServiceConfig(Settings, section="service"):
     envs: int = setting(
         0,
         "environments that one worker plays at a time; a message holds two episodes of each, fewer "
-        "where they are too large for it. 0: 16, fewer where episodes are longer than 8 steps, so "
-        "that new weights are waited for no longer",
+        "where they are too large for it. 0: 16, or fewer where episodes are longer than 8 steps, "
+        "so that workers get new weights as often",
         low=0,
         high=512,
     )

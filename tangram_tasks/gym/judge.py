@@ -22,7 +22,7 @@ from tangram_tasks.gym.task import SUCCESS, GymConfig
 
 OBSERVATION, ACHIEVED, DESIRED = "observation", "achieved_goal", "desired_goal"
 MOST = 1e6  # of a number that is observed: only what is wrong lies beyond
-FAR = 1e3  # a goal that is reached by nobody
+FAR = 1e3  # of an entry of a goal: further than anything comes, if its space has no bounds
 TRIED = 10  # random steps by which an environment is looked at
 Environment = gymnasium.Env[Any, Any]
 

@@ -12,7 +12,7 @@ import yaml
 
 from conf.cli import composed
 from tangram_core.registry import find_agent, find_task, load_own
-from tangram_core.run.code import override
+from tangram_core.run.code import code_of, override
 from tests.cluster.processes import LIMIT_S, refused, run_here, started, wait_for_file
 from tests.cluster.test_cli import READ
 from tests.core.examples import EXAMPLES
@@ -189,6 +189,15 @@ def test_another_package_announces_its_own(tmp_path: Path, monkeypatch: pytest.M
     found = yaml.safe_load(settings)
     assert found["task"] == {"kind": "their_point", "reach": 0.2, "stride": 0.2}
     assert found["agent"]["kind"] == "their_td3"
+
+
+def test_code_is_found_in_settings_by_its_form() -> None:
+    """These come from files and from the wire: anything may stand there."""
+    code = {"kind": "a.py:A", "other": "b.py:B", "imports": ["panda_gym", "mine"]}
+    found = {"task": "a.py:A", "task.other": "b.py:B", "task.imports": "[panda_gym,mine]"}
+    assert code_of({"task": code}) == found
+    plain = {"kind": "gym", "imports": ["panda_gym"], "seed": 1}
+    assert code_of({"task": plain, "agent": {"imports": 5}, "run_dir": "a.py:A"}) == {}
 
 
 def test_a_program_names_a_file_as_a_command_line_does() -> None:

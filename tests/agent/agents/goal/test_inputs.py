@@ -71,7 +71,7 @@ def test_what_is_far_or_constant_stays_within_bounds() -> None:
     def seen(*rows: tuple[float, float]) -> Any:
         arrays = np.array(rows, "f4"), normaliser.mean, normaliser.scale
         found = normalised(*arrays)
-        assert (normalised(*map(torch.from_numpy, arrays)).numpy() == found).all()
+        assert normalised(*map(torch.from_numpy, arrays)).numpy() == pytest.approx(found)
         return found.tolist()
 
     assert seen((0.5, 9)) == [[0.5, FURTHEST]]
