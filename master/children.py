@@ -1,18 +1,19 @@
 """Child processes that end with their parent, and are started again when they fail."""
 
 import os
+import select
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from threading import Thread
-from typing import IO
 
 import psutil
 
+from master.forking import Body, run_command, start
 from tangram_core.run.process import Lifeline
 
 # A process that lived for so long starts with a clean record.
@@ -23,8 +24,6 @@ MAX_DELAY_S = 30.0
 HUNG_STATUS = 1  # of a watchdog, though others use it, too
 USAGE_STATUS = 2
 TAIL_LINES = 12
-THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @dataclass(eq=False)
@@ -32,12 +31,13 @@ class Child:
     """One process, or several one after another in the same place.
 
     Attributes:
-        arguments: of this Python.
+        arguments: the name of a command, and its own.
         log: file that its output is appended to, None for the terminal.
         nice: added to its niceness.
         patience_s: without progress before its watchdog ends it, 0 for none.
         restarts: in a row, without a steady time between.
         next_start_s: monotonic time of the next start, None while nothing is planned.
+        body: what runs in the process with the arguments.
     """
 
     name: str
@@ -47,7 +47,9 @@ class Child:
     patience_s: float = 0.0
     restarts: int = 0
     next_start_s: float | None = 0.0
-    _process: "subprocess.Popen[bytes] | None" = field(default=None, init=False)
+    body: Body = run_command
+    _process: ForkServerProcess | None = field(default=None, init=False)
+    _handle: int | None = field(default=None, init=False)  # None, too, where it has just ended
     _lifeline: Lifeline | None = field(default=None, init=False)
     _started_s: float = field(default=0.0, init=False)
     _frozen_s: float = field(default=0.0, init=False)
@@ -55,7 +57,7 @@ class Child:
     @property
     def alive(self) -> bool:
         """Whether a process runs here."""
-        return self._process is not None and self._process.poll() is None
+        return self._handle is not None and not _has_ended(self._handle, wait=False)
 
     @property
     def kept(self) -> bool:
@@ -63,34 +65,37 @@ class Child:
         return self._process is not None or self.next_start_s is not None
 
     def start(self, ended: Callable[["Child"], None]) -> None:
-        """Start a process; `ended` is called with this, in another thread, when it ends."""
+        """Start a process; `ended` is called with this, in another thread, when it ends.
+
+        Raises:
+            TangramError: no process can be started.
+        """
         self.next_start_s, self._started_s, self._frozen_s = None, time.monotonic(), 0.0
         self._lifeline = Lifeline()
-        output = self._output()
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, *self.arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                env=self._lifeline.environment(environment()),
-                pass_fds=[self._lifeline.read_end],
-                # Ctrl-C reaches the whole terminal; the parent decides who ends when.
-                start_new_session=True,
-            )
+            self._process = start(self.body, self.arguments, self.log, self._lifeline.read_end)
         finally:
             self._lifeline.started()
-            if output is not None and not isinstance(output, int):
-                output.close()
-        self._be_nice()
-        Thread(target=self._wait, args=(self._process, ended), daemon=True).start()
+        pid = self._process.pid or 0
+        with suppress(ProcessLookupError):  # ended already; the waiting thread tells
+            self._handle = os.pidfd_open(pid)
+            if self.nice:
+                nice = os.getpriority(os.PRIO_PROCESS, pid)
+                os.setpriority(os.PRIO_PROCESS, pid, nice + self.nice)
+        handle = None if self._handle is None else os.dup(self._handle)
+        Thread(target=self._wait, args=(handle, ended), daemon=True).start()
 
     def clear(self) -> int:
         """Forget a process that has ended; returns its exit status, 0 where there is none."""
-        status = 0 if self._process is None else self._process.wait()
+        status = 0
+        if self._process is not None:
+            self._process.join()
+            status = self._process.exitcode or 0
         if self._lifeline is not None:
             self._lifeline.cut()
-        self._process, self._lifeline = None, None
+        if self._handle is not None:
+            os.close(self._handle)
+        self._process, self._handle, self._lifeline = None, None, None
         return status
 
     def plan_restart(self, status: int) -> bool:
@@ -133,8 +138,9 @@ class Child:
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal, if the process still runs."""
-        if self._process is not None:
-            self._process.send_signal(number)
+        if self._handle is not None:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._handle, number)
 
     def tail(self, count: int = TAIL_LINES) -> str:
         """The last lines of its log."""
@@ -143,27 +149,21 @@ class Child:
         lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
         return "\n".join(lines[-count:])
 
-    def _output(self) -> IO[bytes] | int | None:
-        """Its log; nothing where the disk does not take one: that is no reason to be without it."""
-        try:
-            return None if self.log is None else self.log.open("ab")
-        except OSError:
-            return subprocess.DEVNULL
-
-    def _wait(self, process: "subprocess.Popen[bytes]", ended: Callable[["Child"], None]) -> None:
-        process.wait()
+    def _wait(self, handle: int | None, ended: Callable[["Child"], None]) -> None:
+        if handle is not None:
+            _has_ended(handle, wait=True)
+            os.close(handle)
         ended(self)
 
-    def _be_nice(self) -> None:
-        if self.nice and self._process is not None:
-            try:
-                current = os.getpriority(os.PRIO_PROCESS, self._process.pid)
-                os.setpriority(os.PRIO_PROCESS, self._process.pid, current + self.nice)
-            except ProcessLookupError:
-                return  # ended already; the waiting thread tells
+
+def _has_ended(handle: int, *, wait: bool) -> bool:
+    """Of a process; its server may be gone."""
+    poll = select.poll()
+    poll.register(handle, select.POLLIN)
+    return bool(poll.poll(None if wait else 0))
 
 
-def _is_stopped(pid: int) -> bool:
+def _is_stopped(pid: int | None) -> bool:
     """Whether there is such a process, and a signal has stopped it."""
     try:
         return psutil.Process(pid).status() == psutil.STATUS_STOPPED
@@ -179,17 +179,3 @@ def describe(status: int) -> str:
         return signal.Signals(-status).name
     except ValueError:
         return f"signal {-status}"
-
-
-def command(name: str) -> list[str]:
-    """Run tangram-NAME of this installation, whatever lies in the current folder."""
-    return ["-P", "-m", "tangram_cli", name]
-
-
-def environment() -> dict[str, str]:
-    """One thread each, since several processes share the cores, and the same packages as here."""
-    variables = dict.fromkeys(THREADS, "1") | dict(os.environ)
-    if (ROOT / "pyproject.toml").exists():  # a source tree, which need not be installed
-        paths = [variables.get("PYTHONPATH", ""), str(ROOT)]
-        variables["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
-    return variables | {"PYTHONUNBUFFERED": "1"}

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from master.children import MAX_RESTARTS, Child, command, describe
+from master.children import MAX_RESTARTS, Child, describe
 from master.config import MasterConfig
 from master.hub.security import listening_place
 from master.record.resumable import check_resumable
@@ -267,7 +267,7 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
     """A worker that joins by the run's connection file, with a log of its own."""
     name = role if role == "evaluator" else f"worker {index}"
     arguments = [
-        *command("worker"),
+        "worker",
         override("connect", str(folder.connection)),
         f"index={index}",
         f"role={role}",
@@ -277,10 +277,10 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
 
 
 def master_arguments(config: MasterConfig, folder: RunFolder) -> list[str]:
-    """How the master is started, as arguments of this Python."""
+    """The command that starts the master."""
     in_step = config.service.mode == "lockstep"
     return [
-        *command("master"),
+        "master",
         override("from_config", str(folder.config)),
         override("run_dir", str(folder.path)),
         *(

@@ -32,9 +32,15 @@ class OwnPackages:
         return PathFinder.find_spec(fullname, [str(HOME)], target)
 
 
+def own_packages_first() -> None:
+    """From here on."""
+    if OwnPackages not in sys.meta_path:
+        sys.meta_path.insert(0, OwnPackages)
+
+
 def run(module: str, function: str) -> int:
     """Run a command out of our packages and return its exit status; 130 after Ctrl-C."""
-    sys.meta_path.insert(0, OwnPackages)
+    own_packages_first()
     # numpy multiplies small matrices here: more threads wait for each other, longer than they
     # compute, the more so beside other work. Before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

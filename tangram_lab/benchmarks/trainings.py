@@ -11,7 +11,6 @@ from typing import Any
 import psutil
 import zmq
 
-from master.children import command
 from tangram_core.errors import TangramError
 from tangram_core.run.code import override
 from tangram_core.run.process import Lifeline
@@ -20,6 +19,11 @@ from worker.status import ask_status
 LOOK_S = 0.3
 PATIENCE_S = 60.0
 MIB = 2**20
+
+
+def command(name: str) -> list[str]:
+    """Run tangram-NAME of this installation, whatever lies in the current folder."""
+    return [sys.executable, "-P", "-m", "tangram_cli", name]
 
 
 def start_training(folder: Path, *settings: str, name: str = "train") -> "subprocess.Popen[bytes]":
@@ -33,7 +37,7 @@ def start_training(folder: Path, *settings: str, name: str = "train") -> "subpro
         variables = lifeline.environment(variables)
     with (folder / "told").open("wb") as told:
         process = subprocess.Popen(
-            [sys.executable, *command(name), override("run_dir", str(folder)), *settings],
+            [*command(name), override("run_dir", str(folder)), *settings],
             stdout=told,
             stderr=told,
             env=variables,

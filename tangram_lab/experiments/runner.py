@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from master.children import Child, command, describe
+from master.children import Child, describe
 from master.record.rundir import RunFolder
 from master.signals import SIGNALS
 from tangram_core.errors import ConfigError
@@ -66,8 +66,7 @@ class Work:
 
     def _child(self, told: list[str], log: str) -> Child:
         write_whole(self.run_dir / TOLD, json.dumps({"told": self.job.told}).encode())
-        name, *rest = told
-        return Child(self.job.name, [*command(name), *rest], self.run_dir / log)
+        return Child(self.job.name, told, self.run_dir / log)
 
     def write(self, folder: Path, study: str) -> str:
         """Add the rows of all tests, and of a curve that is drawn; returns what to tell."""

@@ -68,7 +68,7 @@ def test_the_same_numbers_come_twice_and_stops_and_kills_in_the_middle_change_no
         assert process.wait(LIMIT_S) == 0
     reached = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1], []).updates
     with started("tangram-train", *settings, "resume=auto", cwd=tmp_path) as process:
-        for victim, more in (("role=player", 10), ("-m tangram_cli master", 20)):
+        for victim, more in (("role=player", 10), ("tangram-master", 20)):
             until_updates(folder, reached + more)  # so the players have joined, too
             found = [pid for pid in pids_of(folder) if victim in _line(pid)]
             os.kill(min(found), signal.SIGKILL)

@@ -38,7 +38,8 @@ PARENT = """
     import signal, subprocess, sys
     from master.children import Child
     from pathlib import Path
-    child = Child("child", ["-c", sys.argv[1], "plain"], Path(sys.argv[2]))
+    from tests.bodies import run_code
+    child = Child("child", ["-c", sys.argv[1], "plain"], Path(sys.argv[2]), body=run_code)
     child.start(lambda _child: None)
     print(child._process.pid, flush=True)
     while True:

@@ -3,19 +3,34 @@
 import json
 import os
 import signal
+import time
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
+import psutil
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
 
 from master import children as children_module
-from master.children import MAX_RESTARTS, Child, describe, environment
+from master.children import MAX_RESTARTS, Child, describe
+from master.forking import environment
 from tangram_core.run.code import override
+from tests.bodies import run_code
 
 LIMIT_S = 100.0
+
+
+def child(name: str, code: str, log: Path | None = None, **more: Any) -> Child:
+    return Child(name, ["-c", code], log, body=run_code, **more)
+
+
+def wait_for_status(pid: int, status: str) -> None:
+    end = time.monotonic() + LIMIT_S
+    while psutil.Process(pid).status() != status:
+        assert time.monotonic() < end, status
 
 
 @pytest.mark.fast
@@ -66,20 +81,22 @@ def test_restarts_come_later_and_later_and_end(
 
 @pytest.mark.cluster
 def test_a_child_has_its_own_session_niceness_thread_and_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     code = (
-        "import os, json, sys; sys.stdin.read(); print(json.dumps([os.getsid(0) == os.getpid(), "
-        "os.environ['OMP_NUM_THREADS']])); raise SystemExit(7)"
+        "import os, json, psutil; assert not os.read(0, 1); "
+        "print(json.dumps([os.getsid(0) == os.getpid(), os.environ['OMP_NUM_THREADS'], "
+        "psutil.Process().cmdline()[0][:7]])); raise SystemExit(7)"
     )
-    made = Child("worker 0", ["-c", code], tmp_path / "log")
+    made = child("worker 0", code, tmp_path / "log")
     ended: SimpleQueue[Child] = SimpleQueue()
     for lives in (1, 2):
         made.start(ended.put)
         assert ended.get(timeout=LIMIT_S) is made
         assert made.clear() == 7
-        assert [json.loads(line) for line in made.tail().splitlines()] == [[True, "1"]] * lives
+        assert [json.loads(line) for line in made.tail().splitlines()] == [
+            [True, environment()["OMP_NUM_THREADS"], "tangram"]
+        ] * lives
     assert not made.alive
     (tmp_path / "log").unlink()
     (tmp_path / "log").mkdir()  # as where the run folder is gone: no reason to be without it
@@ -88,7 +105,7 @@ def test_a_child_has_its_own_session_niceness_thread_and_log(
     assert made.clear() == 7
     (tmp_path / "log").rmdir()
 
-    polite = Child("polite", ["-c", "import signal; signal.pause()"], tmp_path / "log", nice=3)
+    polite = child("polite", "import signal; signal.pause()", tmp_path / "log", nice=3)
     polite.start(ended.put)
     assert polite._process is not None
     nice = os.getpriority(os.PRIO_PROCESS, polite._process.pid)
@@ -99,7 +116,9 @@ def test_a_child_has_its_own_session_niceness_thread_and_log(
 
 
 @pytest.mark.fast
-def test_the_users_own_number_of_threads_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_has_one_thread_or_the_users_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    assert environment()["OMP_NUM_THREADS"] == "1"
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     assert environment()["OMP_NUM_THREADS"] == "4"
 
@@ -107,7 +126,7 @@ def test_the_users_own_number_of_threads_wins(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.cluster
 def test_a_child_ends_with_its_parent() -> None:
     code = "import signal, tangram_core.run.process as own; own.watch_parent(); signal.pause()"
-    made = Child("worker", ["-c", code])
+    made = child("worker", code)
     ended: SimpleQueue[Child] = SimpleQueue()
     made.start(ended.put)
     try:
@@ -119,18 +138,18 @@ def test_a_child_ends_with_its_parent() -> None:
 
 @pytest.mark.cluster
 def test_a_process_that_is_stopped_for_a_while_is_left_alone() -> None:
-    made = Child("worker", ["-c", "import signal; signal.pause()"], patience_s=10.0)
+    made = child("worker", "import signal; signal.pause()", patience_s=10.0)
     made.start(lambda _: None)
     pid = made._process.pid
     try:
         made.signal(signal.SIGSTOP)
-        os.waitid(os.P_PID, pid, os.WSTOPPED)
+        wait_for_status(pid, psutil.STATUS_STOPPED)
         assert not made.kill_frozen(9.0)
         made.signal(signal.SIGCONT)
-        os.waitid(os.P_PID, pid, os.WCONTINUED)
+        wait_for_status(pid, psutil.STATUS_SLEEPING)
         assert not made.kill_frozen(9.0)  # it counts from the beginning the next time
         made.signal(signal.SIGSTOP)
-        os.waitid(os.P_PID, pid, os.WSTOPPED)
+        wait_for_status(pid, psutil.STATUS_STOPPED)
         assert not made.kill_frozen(9.0)
         made.patience_s = 0.0  # no watchdog
         assert not made.kill_frozen(1e9)

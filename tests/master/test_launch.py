@@ -19,6 +19,7 @@ from master.watch.console import logging_to, sturdy_console
 from tangram_core.errors import ConfigError
 from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import from_mapping
+from tests.bodies import run_code
 
 LIMIT_S = 100.0
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
@@ -32,9 +33,6 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
     )
     arguments = master_arguments(master, RunFolder(tmp_path))
     assert arguments == [
-        "-P",
-        "-m",
-        "tangram_cli",
         "master",
         f"from_config='{tmp_path}/config.yaml'",
         f"run_dir='{tmp_path}'",
@@ -127,6 +125,8 @@ def launcher(
     for player, own in zip(made._players, players, strict=True):
         player.arguments = ["-c", own]
     made._evaluator.arguments = ["-c", WORKER]
+    for one in (made._master, *made._workers):
+        one.body = run_code
     return made
 
 

@@ -263,7 +263,7 @@ def _garbage(trial: Trial) -> None:
         raw.sendall(trial.dice.randbytes(4096))
 
 
-EVALUATOR, MASTER = "role=evaluator", "-m tangram_cli master"
+EVALUATOR, MASTER = "role=evaluator", "tangram-master"
 KINDS: dict[str, Callable[[Trial], None]] = {
     "worker killed": _signal("role=player", signal.SIGKILL),
     "worker asked to end": _signal("role=player", signal.SIGTERM),

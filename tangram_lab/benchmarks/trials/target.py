@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,7 +19,6 @@ import psutil
 import yaml
 import zmq
 
-from master.children import command
 from tangram_core.errors import TangramError
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
@@ -28,7 +26,14 @@ from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
 from tangram_core.wire.arrays import columns
 from tangram_core.wire.messages import Hello
 from tangram_core.wire.schema import opened, seal
-from tangram_lab.benchmarks.trainings import MIB, PATIENCE_S, processes_of, start_training, wait_for
+from tangram_lab.benchmarks.trainings import (
+    MIB,
+    PATIENCE_S,
+    command,
+    processes_of,
+    start_training,
+    wait_for,
+)
 from tangram_lab.benchmarks.trials.chaos import SETTINGS
 from worker.status import ask_status
 from worker.talk.discovery import find_master
@@ -86,7 +91,7 @@ class Target:
     @property
     def master(self) -> psutil.Process:
         """The process that learns."""
-        found = [p for p, line in processes_of(self.folder).items() if "tangram_cli master" in line]
+        found = [p for p, line in processes_of(self.folder).items() if "tangram-master" in line]
         if not found:
             raise TangramError("no master runs")
         return found[0]
@@ -234,7 +239,7 @@ def episodes_of(setup: Setup, count: int) -> Episodes:
 def one_line(*arguments: str, cwd: Path) -> Seen:
     """Whether a command refuses in one line, with status 2."""
     done = subprocess.run(
-        [sys.executable, *command(arguments[0]), *arguments[1:]],
+        [*command(arguments[0]), *arguments[1:]],
         cwd=cwd,
         capture_output=True,
         text=True,

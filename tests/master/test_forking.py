@@ -1,0 +1,66 @@
+"""The server that forks children: what may happen to it."""
+
+import os
+import signal
+import time
+from multiprocessing import forkserver
+from queue import SimpleQueue
+
+import psutil
+import pytest
+
+from master.children import Child
+from master.forking import HELD_BACK
+from tests.bodies import run_code
+
+pytestmark = pytest.mark.cluster
+
+LIMIT_S = 100.0
+WAITS = "import signal; signal.pause()"
+
+
+def waiting(ended: "SimpleQueue[Child]") -> Child:
+    made = Child("worker", ["-c", WAITS], body=run_code)
+    made.start(ended.put)
+    return made
+
+
+def server() -> psutil.Process:
+    return psutil.Process(forkserver._forkserver._forkserver_pid)
+
+
+def test_signals_to_a_whole_job_end_its_children_and_leave_the_server() -> None:
+    ended: SimpleQueue[Child] = SimpleQueue()
+    first = waiting(ended)
+    before = server()
+    for number in HELD_BACK:
+        before.send_signal(number)
+    for number in HELD_BACK:
+        one = waiting(ended)
+        one.signal(number)  # it may be forked and no more
+        assert ended.get(timeout=LIMIT_S) is one
+        assert one.clear() in (-number, 1)  # 1: KeyboardInterrupt
+    assert first.alive
+    assert server() == before
+    first.signal(signal.SIGKILL)
+    assert first.clear() == -signal.SIGKILL
+
+
+def test_children_outlive_a_killed_server_and_others_can_be_started() -> None:
+    ended: SimpleQueue[Child] = SimpleQueue()
+    first = waiting(ended)
+    before = server()
+    before.kill()
+    end = time.monotonic() + LIMIT_S
+    while before.status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < end
+        os.sched_yield()
+    second = waiting(ended)
+    assert first.alive
+    assert second.alive
+    assert server() != before
+    for one in (first, second):
+        one.signal(signal.SIGKILL)
+        assert ended.get(timeout=LIMIT_S) is one
+    assert first.clear() == 255  # nobody saw how it ended
+    assert second.clear() == -signal.SIGKILL
