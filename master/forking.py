@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -56,17 +57,21 @@ def start(
         read_end: of its lifeline.
 
     Raises:
-        TangramError: the server does not start, or has just been killed.
+        TangramError: the server does not start, or was killed just now.
     """
     _context.set_forkserver_preload(["tangram_cli.forkserver"])
-    with _environment():
-        forkserver.ensure_running()
     with Connection(os.dup(read_end), writable=False) as lifeline:
         process = _context.Process(target=_become, args=(body, arguments, log, lifeline))
         try:
+            with _environment():
+                forkserver.ensure_running()
             process.start()
         except (EOFError, OSError) as error:
-            raise TangramError(f"no process can be started: {error}") from error
+            folder = tempfile.gettempdir()
+            raise TangramError(
+                f"no process can be started ({error}): is {folder} (TMPDIR) a short path that can "
+                "be written to, and is memory left?"
+            ) from error
     return process
 
 
