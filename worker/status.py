@@ -1,6 +1,7 @@
 """tangram-status: how a run stands, asked of its master from anywhere that its workers may be."""
 
 import json
+import math
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -169,6 +170,8 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
     yield "episodes", f"{n['episodes']:,.0f}, {n['transitions_per_s']:,.1f} transitions/s"
     due = f"{n['lag_updates']:,.0f} due"
     yield "updates", f"{n['updates']:,.0f}, {n['updates_per_s']:,.1f}/s, {due}"
+    if n["could_play"] > 0 and n["could_learn"] > 0:
+        yield "balance", _balance(n["could_play"], n["could_learn"], n["players"])
     yield "time", _time(n["elapsed_s"], n["left_s"], n["share"])
     share = n["replay"] / max(n["replay_capacity"], 1.0)
     yield "replay", f"{n['replay']:,.0f} transitions, {share:.0%} of its capacity"
@@ -183,6 +186,14 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
             yield row, f"{n[f'hub/{name}']:,.0f} {who}"
     if n["undone_updates"] > 0:
         yield "undone updates", f"{n['undone_updates']:,.0f} were not finite"
+
+
+def _balance(play: float, learn: float, players: float) -> str:
+    """Which side waits for the other, and how many workers would do."""
+    waits = "workers wait" if play > learn else "the learner waits"
+    text = f"{waits}: {play:,.0f} transitions/s can be played, {learn:,.0f} learned from"
+    enough = max(1, math.ceil(players * learn / play))
+    return f"{text}; {enough:,} worker{'s' if enough > 1 else ''} would do"
 
 
 def _time(elapsed_s: float, left_s: float, share: float) -> str:

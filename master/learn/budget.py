@@ -56,14 +56,16 @@ class Rates:
 
     def __init__(self, window_s: float = RATE_WINDOW_S) -> None:
         self.window_s = window_s
-        self._marks: deque[tuple[float, int, int, float]] = deque()
+        self._marks: deque[tuple[float, int, int, float, float]] = deque()
         self._first: tuple[float, float] | None = None
 
-    def mark(self, now_s: float, transitions: int, updates: int, share: float) -> None:
+    def mark(
+        self, now_s: float, transitions: int, updates: int, share: float, learning_s: float
+    ) -> None:
         """Note the counters at a time of a steady clock."""
         if self._first is None:
             self._first = (now_s, share)
-        self._marks.append((now_s, transitions, updates, share))
+        self._marks.append((now_s, transitions, updates, share, learning_s))
         while len(self._marks) > 2 and now_s - self._marks[1][0] >= self.window_s:
             self._marks.popleft()
 
@@ -75,6 +77,10 @@ class Rates:
         """Updates per second."""
         return self._rate(2)
 
+    def updates_per_busy_s(self) -> float:
+        """Updates per second of learning: what it would be if nothing were waited for."""
+        return self._rate(2, of=4)
+
     def left_s(self) -> float | None:
         """Seconds until the budget is used, at the pace since the start; None when unknown."""
         if self._first is None:
@@ -85,8 +91,8 @@ class Rates:
             return None
         return (now_s - self._first[0]) * (1.0 - share) / gained
 
-    def _rate(self, column: int) -> float:
+    def _rate(self, column: int, of: int = 0) -> float:
         if len(self._marks) < 2:
             return 0.0
         first, last = self._marks[0], self._marks[-1]
-        return float(last[column] - first[column]) / max(last[0] - first[0], 1e-9)
+        return float(last[column] - first[column]) / max(last[of] - first[of], 1e-9)

@@ -4,7 +4,7 @@ import json
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
@@ -63,7 +63,8 @@ class StatusCollector:
     def mark(self) -> None:
         """Note the counters, from which rates follow; a few times in a second."""
         trainer, share = self._guard.trainer, self._budget.share
-        self._rates.mark(time.monotonic(), trainer.transitions, trainer.updates, share)
+        now_s, learning_s = time.monotonic(), trainer.learning_s
+        self._rates.mark(now_s, trainer.transitions, trainer.updates, share, learning_s)
 
     def collect(self, queue: int, each: bool = True) -> RunStatus:
         """The present state.
@@ -101,6 +102,7 @@ class StatusCollector:
             "scored_updates": record.scored_version,
             **{TEST + name: value for name, value in record.scores.items()},
             **self.played,
+            **(self._balance() if each else {}),
             # Last: where there are more numbers than a status takes, these are left out.
             **{f"hub/{name}": count for name, count in sorted(self._hub.counters.items())},
         }
@@ -111,6 +113,16 @@ class StatusCollector:
             "activity": HOMELESS if self._checkpointer.homeless else activity(trainer, players),
         }
         return RunStatus(numbers, texts, _workers(self._hub.peers if each else (), trainer.updates))
+
+    def _balance(self) -> dict[str, float]:
+        """Transitions per second if no player ever waited, and if the learner never did."""
+        trainer, limiter = self._guard.trainer, self._guard.trainer.rate_limiter
+        played = trainer.transitions / max(limiter.transitions, 1)  # for each that counts
+        learned = self._rates.updates_per_busy_s() / trainer.pace.updates_per_transition
+        return {
+            "could_play": could_play(self._hub.peers, trainer.setup.spec.horizon),
+            "could_learn": learned * played,
+        }
 
 
 HOMELESS = "waiting for the run folder, which is gone or another one"
@@ -128,6 +140,14 @@ def activity(trainer: Trainer, players: int) -> str:
     if limiter.transitions < starts:
         return f"filling the replay, {limiter.transitions:,} of {starts:,}"
     return "waiting for episodes"
+
+
+def could_play(peers: Iterable[Peer], horizon: int) -> float:
+    """Transitions per second of all players together, if none ever waited; 0 while unknown."""
+    told = [peer.stats for peer in peers if peer.role == "player"]
+    found = [(one.get("episodes", 0.0), one.get("playing_s", 0.0)) for one in told]
+    rates = [episodes / seconds for episodes, seconds in found if seconds > 0.0]
+    return horizon * sum(rates) * len(told) / max(len(rates), 1)
 
 
 def _workers(peers: Sequence[Peer], updates: int) -> Floats:

@@ -113,6 +113,30 @@ def test_the_line_that_starts_an_evaluator_works_as_it_is(tmp_path: Path) -> Non
     assert _evaluator(str(path)) == said
 
 
+@pytest.mark.parametrize(
+    ("play", "learn", "told"),
+    [
+        (0.0, 500.0, None),
+        (
+            4000.0,
+            500.0,
+            "workers wait: 4,000 transitions/s can be played, 500 learned from; 1 worker would do",
+        ),
+        (
+            400.0,
+            500.0,
+            "the learner waits: 400 transitions/s can be played, 500 learned from; "
+            "5 workers would do",
+        ),
+    ],
+)
+def test_who_waits_for_whom_and_how_many_workers_would_do(
+    play: float, learn: float, told: str | None
+) -> None:
+    numbers = defaultdict(float, could_play=play, could_learn=learn, players=4.0)
+    assert dict(_lines(numbers, {})).get("balance") == told
+
+
 def test_who_was_refused_is_shown_where_anybody_was() -> None:
     numbers = defaultdict(float, {"hub/refused_keys": 3.0, "hub/refused_handshakes": 1000.0})
     shown = dict(_lines(numbers, {}))

@@ -23,7 +23,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     Raises:
         TangramError: a setting that cannot work, or a master that refuses or is gone for long.
     """
-    acting, report = Acting(setup.agent.actor(setup.task)), Report()
+    acting = Acting(setup.agent.actor(setup.task))
     # What is too large for a message is split.
     service, horizon = config.service, setup.spec.horizon
     size = min(service.batch_episodes(horizon), most_episodes(setup.spec))
@@ -33,6 +33,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     ):
         if client.stopped:
             return 0
+        report = Report()
         with report.waiting("no weights yet"):
             first = client.wait_for_weights()
         if first is None:
@@ -54,8 +55,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
             for batch in parts(episodes, size):
                 if not client.send(batch, acting.version):
                     break
-            client.stats["episodes"] = float(rollout.episode)
-            report.played(episodes.count, acting.version)
+            client.stats = report.played(episodes.count, acting.version)
     return 0
 
 
@@ -78,7 +78,7 @@ def _play_in_step(client: Client, acting: Acting, rollout: Rollout, report: Repo
         episodes = _play(rollout, acting, client, groups=order.episodes // rollout.envs)
         if episodes.count < order.episodes or not client.send(episodes, acting.version):
             return
-        report.played(episodes.count, acting.version)
+        client.stats = report.played(episodes.count, acting.version)
         done = order
 
 

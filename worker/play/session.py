@@ -123,6 +123,7 @@ class Report:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
+        self._totals = {"episodes": 0.0, "playing_s": 0.0}
         self._begin()
 
     def _begin(self) -> None:
@@ -143,12 +144,19 @@ class Report:
         finally:
             self._waited += self._clock() - start
 
-    def played(self, episodes: int, version: int) -> None:
-        """Count episodes; a line when it is time."""
+    def played(self, episodes: int, version: int) -> dict[str, float]:
+        """Count episodes; a line when it is time.
+
+        Returns:
+            Episodes since the start, and seconds without those of waiting.
+        """
         self._episodes += episodes
         passed = self._clock() - self._since
+        now = {"episodes": self._episodes, "playing_s": passed - self._waited}
+        totals = {name: value + now[name] for name, value in self._totals.items()}
         if passed < REPORT_S:
-            return
+            return totals
+        self._totals = totals
         values = {
             "episodes": self._episodes,
             "seconds": passed,
@@ -162,3 +170,4 @@ class Report:
             extra={"event": "played", **values},
         )
         self._begin()
+        return totals

@@ -56,20 +56,22 @@ def test_episodes_are_taken_up_to_the_bound(bound: int, episodes: int, takes: bo
 def test_rates_over_a_window() -> None:
     rates = Rates(window_s=10.0)
     assert (rates.transitions_per_s(), rates.updates_per_s(), rates.left_s()) == (0.0, 0.0, None)
-    # Slow for 20 s, then ten times as fast: the slow part leaves the window.
+    # Slow for 20 s, then ten times as fast: the slow part leaves the window. It learns for a fifth.
     for second in range(21):
-        rates.mark(second, 100 * second, second, second / 100)
+        rates.mark(second, 100 * second, second, second / 100, second / 5)
     assert rates.transitions_per_s() == pytest.approx(100.0)
     for second in range(21, 41):
-        rates.mark(second, 2000 + 1000 * (second - 20), 20 + 10 * (second - 20), second / 100)
+        passed = second - 20
+        rates.mark(second, 2000 + 1000 * passed, 20 + 10 * passed, second / 100, second / 5)
     assert rates.transitions_per_s() == pytest.approx(1000.0)
     assert rates.updates_per_s() == pytest.approx(10.0)
+    assert rates.updates_per_busy_s() == pytest.approx(50.0)
     assert rates.left_s() == pytest.approx(60.0)
 
 
 def test_time_left_of_a_resumed_run_counts_from_its_new_start() -> None:
     rates = Rates()
-    rates.mark(0.0, 0, 0, 0.5)
+    rates.mark(0.0, 0, 0, 0.5, 0.0)
     assert rates.left_s() is None
-    rates.mark(10.0, 0, 0, 0.6)
+    rates.mark(10.0, 0, 0, 0.6, 0.0)
     assert rates.left_s() == pytest.approx(40.0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from master.watch.report import could_play
 from master.watch.result import make_result
 from tangram_core.run.process import Every
 from tangram_core.spec import Episodes
@@ -64,6 +65,15 @@ def test_who_takes_part_is_told_one_by_one_to_those_who_listen_only(tmp_path: Pa
     counts = [(status.numbers["players"], status.numbers["evaluators"]) for status in shown(made)]
     assert (rows, counts) == ([4, 0, 0], [(3, 1)] * 3)
     assert [len(status.workers) for status in hub.values("tell")] == [4]
+
+
+def test_what_could_be_played_is_that_of_those_who_told_for_all() -> None:
+    hub = FakeHub(MADE, roles=["player"] * 3 + ["evaluator"])
+    assert could_play(hub.peers, horizon=10) == 0.0
+    told = [{"episodes": 100.0, "playing_s": 50.0}, {"episodes": 8.0, "playing_s": 2.0}, {}]
+    for peer, stats in zip(hub.peers, [*told, {"episodes": 9.0, "playing_s": 1.0}], strict=True):
+        peer.stats = stats
+    assert could_play(hub.peers, horizon=10) == 10 * (2.0 + 4.0) / 2 * 3
 
 
 @pytest.mark.parametrize(

@@ -29,19 +29,19 @@ def test_a_line_every_half_minute_with_rate_and_waiting(
 ) -> None:
     caplog.set_level(logging.INFO, "worker.play.session")
     report = Report(clock)
-    report.played(100, 1)
+    assert report.played(100, 1) == {"episodes": 100.0, "playing_s": 0.0}
     with report.waiting("the master is behind"):
         clock.now += 10.0
     clock.now += 19.9
-    report.played(100, 2)
+    assert report.played(100, 2) == pytest.approx({"episodes": 200.0, "playing_s": 19.9})
     assert caplog.messages == ["waits: the master is behind"]
     clock.now += 10.1
-    report.played(200, 3)
+    assert report.played(200, 3) == pytest.approx({"episodes": 400.0, "playing_s": 30.0})
     assert caplog.messages[1:] == [
         "400 episodes in 40 s (10.0/s), 25 % of the time waiting, weights 3"
     ]
     clock.now += 30.0
-    report.played(30, 4)
+    assert report.played(30, 4) == pytest.approx({"episodes": 430.0, "playing_s": 60.0})
     assert caplog.messages[2:] == [
         "30 episodes in 30 s (1.0/s), 0 % of the time waiting, weights 4"
     ]
