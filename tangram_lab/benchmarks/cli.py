@@ -18,14 +18,15 @@ examples:
   tangram-bench learner                     a table of the learner alone
   tangram-bench wire runs=9 out=wire.json   more runs, and a file with machine, versions, commit
   tangram-bench all out=bench.json          wire, learner and scaling (make bench)
-  tangram-bench goals id=PandaPush-v3 minutes=60    ours and Stable-Baselines3 side by side
+  tangram-bench fetch id=PandaPush-v3 minutes=60    ours and Stable-Baselines3 side by side
+  tangram-bench fetch seeds=3 rows=fetch.csv    five tasks; given again, it goes on
   tangram-bench chaos minutes=20 seed=1     random faults over a real training
   tangram-bench attack out=attack.json      every attack that is known, on real trainings
 """
 RATES = {
     "wire": "worker to master, against bare ROUTER-DEALER sockets",
     "learner": "updates, compiled, against single operations",
-    "goals": "a goal environment learned, against Stable-Baselines3 (id=, minutes=)",
+    "fetch": "tasks of Fetch and Panda learned, against Stable-Baselines3",
     "scaling": "more workers, and 64 synthetic ones",
     "gpu": "updates on a GPU, recorded, against other ways there and one core",
 }
@@ -38,6 +39,8 @@ BOUNDS = {
     "runs": (1, 10_000),
     "minutes": (0.01, 1e5),
     "seed": (0, 2**63 - 1),
+    "seeds": (1, 1000),
+    "workers": (0, 1000),
 }
 
 
@@ -53,9 +56,13 @@ def _parser() -> argparse.ArgumentParser:
         one = kinds.add_parser(name, help=text, description=text)
         one.add_argument("--runs", type=int, default=5, help="measurements of each rate (5)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
-        if name == "goals":
-            one.add_argument("--id", default="FetchReach-v4", help="of gymnasium (FetchReach-v4)")
-            one.add_argument("--minutes", type=float, default=5.0, help="of each training (5)")
+        if name == "fetch":
+            one.add_argument("--id", help="of gymnasium (five of Fetch and Panda)")
+            one.add_argument("--minutes", type=float, default=60.0, help="of each training (60)")
+            one.add_argument("--seeds", type=int, default=1, help="of each, from 0 (1)")
+            one.add_argument("--agent", default="goal", help="our preset: goal or push (goal)")
+            one.add_argument("--workers", type=int, default=0, help="of ours (0: one for a core)")
+            one.add_argument("--rows", type=Path, help="CSV file: what it has is not run again")
     for name, text in TRIALS.items():
         one = kinds.add_parser(name, help=text, description=text)
         if name == "chaos":
@@ -83,8 +90,8 @@ def _check(arguments: argparse.Namespace) -> None:
     for name, value in vars(arguments).items():
         if name in BOUNDS:
             check_range(name, value, *BOUNDS[name])
-    if arguments.out is not None:
-        check_writable("out", arguments.out.absolute())
+        if name in ("out", "rows") and value is not None:
+            check_writable(name, value.absolute())
 
 
 def _dashed(argument: str) -> str:

@@ -7,7 +7,7 @@ import torch
 
 from tangram_core.run.process import keep_memory
 from tangram_lab.benchmarks.measure import Row, page, show, write
-from tangram_lab.benchmarks.speed.goals import measure_goals
+from tangram_lab.benchmarks.speed.fetch import TASKS, Match, measure_fetch
 from tangram_lab.benchmarks.speed.learner import measure_gpu, measure_learner
 from tangram_lab.benchmarks.speed.scaling import measure_scaling
 from tangram_lab.benchmarks.speed.wire import measure_wire
@@ -16,7 +16,7 @@ STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
     "wire": lambda given: measure_wire(given.runs),
     "learner": lambda given: measure_learner(given.runs),
     "scaling": lambda given: measure_scaling(given.runs),
-    "goals": lambda given: measure_goals(given.id, given.minutes),
+    "fetch": lambda given: measure_fetch(_matches(given), given.rows),
     "gpu": lambda given: measure_gpu(given.runs),
 }
 
@@ -38,11 +38,18 @@ def run_stages(given: argparse.Namespace) -> int:
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.with_suffix(".md").write_text(page(title, cells))
-    settings = {name: value for name, value in vars(given).items() if name != "out"}
+    settings = {name: value for name, value in vars(given).items() if name not in ("out", "rows")}
     if given.kind == "gpu":
         settings["card"] = torch.cuda.get_device_name()
     write(given.out, {"settings": settings, "rows": [row.plain() for row in rows]})
     return 0
+
+
+def _matches(given: argparse.Namespace) -> list[Match]:
+    """Every task once, then again with the next seed."""
+    tasks = TASKS if given.id is None else (given.id,)
+    rest = (given.minutes, given.agent, given.workers)
+    return [Match(task, seed, *rest) for seed in range(given.seeds) for task in tasks]
 
 
 def cells_of(row: Row) -> dict[str, object]:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,8 @@ import pytest
 from tangram_core.errors import ConfigError
 from tangram_lab.benchmarks.cli import main
 from tangram_lab.benchmarks.measure import Bound, compared, rates, single
+from tangram_lab.benchmarks.speed import fetch
+from tangram_lab.benchmarks.speed.fetch import Curve, Match, measure_fetch
 from tangram_lab.benchmarks.speed.learner import measure_gpu
 from tangram_lab.benchmarks.stages import STAGES, run_stages
 
@@ -71,7 +74,7 @@ def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path:
     ("line", "reason"),
     [
         ("wire runs=0", "runs must be between 1 and 10000, got 0"),
-        ("goals minutes=0", "minutes must be between 0.01 and 100000, got 0"),
+        ("fetch minutes=0", "minutes must be between 0.01 and 100000, got 0"),
         ("chaos minutes=inf", "minutes must be a finite number, between 0.01 and 100000, got inf"),
         ("chaos minutes=0", "minutes must be between 0.01 and 100000, got 0"),
         ("chaos seed=-1", "seed must be between 0 and"),
@@ -103,7 +106,42 @@ def test_all_is_all_that_needs_no_gpu_and_no_robots(monkeypatch: pytest.MonkeyPa
         row = single((name, "case", "unit"), [1.0])
         monkeypatch.setitem(STAGES, name, lambda _, one=row: measured.append(one.stage) or [one])
     assert run_stages(argparse.Namespace(kind="all", out=None)) == 0
-    assert {*STAGES} - {*measured} == {"gpu", "goals"}
+    assert {*STAGES} - {*measured} == {"gpu", "fetch"}
+
+
+@pytest.mark.fast
+def test_a_match_that_has_its_rows_is_not_run_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rows, played = tmp_path / "rows.csv", list[Match]()
+
+    def play(match: Match, name: str) -> tuple[Curve, Curve]:
+        played.append(match)
+        return [(60.0, 10, 1, 0.0), (120.0, 20, 2, 0.9)], [(61.0, 30, 3, float(match.seed))]
+
+    monkeypatch.setattr(fetch, "_play", play)
+    monkeypatch.setattr(fetch, "label", lambda: "theirs")
+    one, two, other = (
+        Match("FetchPush-v4", 0, 1.0, "goal", 0),
+        Match("FetchPush-v4", 1, 1.0, "goal", 0),
+        Match("FetchPush-v4", 0, 1.0, "push", 0),
+    )
+    assert len(measure_fetch([one], rows)) == 4
+    table = measure_fetch([one, two, other], rows)
+    assert played == [one, two, other]
+    found = {name: [] for name in ("success", "seconds", "steps")}
+    for row in table:
+        for name, values in found.items():
+            if f": {name}" in row.case:
+                values.append((row.ours, row.theirs))
+    assert found == {
+        "success": [(0.45, 0.0), (0.45, 1.0), (0.45, 0.0)],
+        "seconds": [(120.0, math.inf), (120.0, 61.0), (120.0, math.inf)],
+        "steps": [(20.0, 30.0)] * 3,
+    }
+    rows.write_text("id\n")
+    with pytest.raises(ConfigError, match=r"rows=.*rows.csv has other columns than id, seed,"):
+        measure_fetch([one], rows)
 
 
 @pytest.mark.cluster
