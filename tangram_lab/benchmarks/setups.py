@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from conf.cli import composed
+from tangram_agent.agents.goal.agent import Goal, GoalConfig
 from tangram_agent.base.types import Transitions
 from tangram_core.arrays import Singles
 from tangram_core.setup import Setup, make_setup
@@ -21,6 +22,17 @@ from worker.play.rollout import Rollout
 def preset(agent: str = "tangram") -> Setup:
     """What tangram-train makes of an agent's preset: one square, moved by PyBullet."""
     return make_setup(composed("train", ["run_dir=x", f"agent={agent}"]))
+
+
+def robot(id: str, module: str, *told: str) -> Setup:  # noqa: A002 - as gymnasium calls it
+    """A goal environment that a module registers, and what is told of its agent."""
+    task = ["task=gym", f"task.id={id}", f"task.imports=[{module}]"]
+    return make_setup(composed("train", ["run_dir=x", *task, *told]))
+
+
+def goal_config(setup: Setup) -> GoalConfig:
+    """What the goal agent of a setup is told."""
+    return cast("Goal", setup.agent).config
 
 
 def place(setup: Setup) -> Place:
@@ -50,14 +62,16 @@ ENVS = 32
 
 
 def played(setup: Setup, count: int) -> Episodes:
-    """Episodes of random actions, without an engine; `count` is a multiple of ENVS."""
+    """Episodes of random actions, tokens without an engine; `count` is a multiple of ENVS."""
 
     def choose(_seen: Arrays, _past: History, generators: Generators) -> Singles:
         size = setup.spec.action_size
         return np.array([g.uniform(-1.0, 1.0, size) for g in generators], np.float32)
 
-    task = place(setup).with_sim(backend="kinematic")
-    with closing(task.make(ENVS)) as env:
+    task = setup.task
+    if isinstance(task, Place):
+        task = task.with_sim(backend="kinematic")
+    with closing(task.make(ENVS, "play")) as env:
         return Rollout(env, task.spec, 0, "player", 0, 0).play(choose, count // ENVS)
 
 

@@ -25,10 +25,10 @@ import numpy as np
 import pandas as pd
 import torch
 
-from conf.cli import composed
 from master.watch.result import commit
 from tangram_core.errors import ConfigError, TangramError
 from tangram_lab.benchmarks.measure import Row, told
+from tangram_lab.benchmarks.setups import goal_config, robot
 from tangram_lab.benchmarks.trainings import start_training
 
 STAGE, LIBRARY = "fetch", "stable_baselines3"
@@ -172,18 +172,15 @@ def _play(match: Match, name: str) -> tuple[Curve, Curve]:
     return ours, theirs
 
 
-def _task(match: Match) -> list[str]:
-    """What a command line says of task and agent."""
-    return ["task=gym", f"task.id={match.id}", f"task.imports=[{match.module}]"] + [
-        f"agent={match.agent}",
-        f"seed={match.seed}",
-    ]
+def _agent(match: Match) -> list[str]:
+    return [f"agent={match.agent}", f"seed={match.seed}"]
 
 
 def _ours(match: Match, folder: Path, cores: list[int]) -> Curve:
     """Our training, on its cores; workers and master take turns where there are fewer."""
     settings = (
-        *_task(match),
+        *("task=gym", f"task.id={match.id}", f"task.imports=[{match.module}]"),
+        *_agent(match),
         f"workers={match.workers or max(2, len(cores) - 1)}",
         *(f"service.eval_seconds={LOOK_S}", f"service.eval_episodes={TESTS}"),
         *(f"max_hours={match.minutes / 60.0}", "max_updates=0"),
@@ -217,25 +214,25 @@ def train(match: Match, cores: Sequence[int]) -> None:
     env = vector.VecNormalize(
         kind([partial(_make, match)] * count), norm_reward=False, clip_obs=5.0
     )
-    same = composed("train", ["run_dir=x", *_task(match)])["agent"]
+    same = goal_config(robot(match.id, match.module, *_agent(match)))
     size = env.action_space.shape[0]
     model = library.TD3(
         "MultiInputPolicy",
         env,
         action_noise=common("noise").NormalActionNoise(np.zeros(size), np.full(size, NOISE)),
-        batch_size=same["batch_size"],
+        batch_size=same.batch_size,
         buffer_size=1_000_000,
         device="auto",
-        gamma=same["gamma"],
+        gamma=same.gamma,
         gradient_steps=count,
-        learning_rate=same["learning_rate"],
+        learning_rate=same.learning_rate,
         learning_starts=1000,
-        policy_kwargs={"net_arch": list(same["hidden"])},
+        policy_kwargs={"net_arch": list(same.hidden)},
         replay_buffer_class=library.HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         seed=match.seed,
-        tau=1.0 - same["polyak"],
-        train_freq=(round(1.0 / same["updates_per_transition"]), "step"),
+        tau=1.0 - same.polyak,
+        train_freq=(round(1.0 / same.updates_per_transition), "step"),
     )
     model.set_logger(common("logger").Logger(None, []))
     test, begun, due = _make(match), time.perf_counter(), LOOK_S

@@ -1,8 +1,11 @@
 """Updates: compiled, and on a GPU."""
 
+import importlib
 from functools import partial
-from typing import cast
+from itertools import pairwise
+from typing import Any, cast
 
+import gymnasium
 import numpy as np
 import torch
 
@@ -11,10 +14,21 @@ from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.base.ddpg import Ddpg
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
-from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates
-from tangram_lab.benchmarks.setups import preset, random_transitions, several, with_agent
+from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates, single
+from tangram_lab.benchmarks.setups import (
+    goal_config,
+    played,
+    preset,
+    random_transitions,
+    robot,
+    several,
+    with_agent,
+)
+from tangram_lab.benchmarks.speed import still
+from tangram_lab.benchmarks.speed.fetch import label
 
 BATCHES = (64, 256)
+HIDDEN, SIZE, EPISODES = [256, 256, 256], 256, 320
 
 
 def measure_learner(runs: int) -> list[Row]:
@@ -28,7 +42,88 @@ def measure_learner(runs: int) -> list[Row]:
         whole = updates(made, learner(made, compiled=True))
         given = ("learner", f"{name}, batch {size}, compiled", "updates/s"), whole
         rows.append(compare(*given, ("single operations", updates(made)), runs, Bound(least)))
-    return rows
+    return [*rows, *_goal_rows(runs)]
+
+
+def _goal_rows(runs: int) -> list[Row]:
+    """The goal agent with what it draws, beside Stable-Baselines3 and what the core can do."""
+    name, case = label(), f"goal agent {HIDDEN}, batch {SIZE}"
+    sizes = f"agent.hidden={HIDDEN}", f"agent.batch_size={SIZE}"
+    setup = robot(still.ID, still.__name__, "agent=goal", *sizes)
+    compiled = goal_updates(setup, compiled=True)
+    left, right = torch.rand(SIZE, HIDDEN[0]), torch.rand(HIDDEN[0], HIDDEN[1])
+
+    def product() -> float:
+        torch.mm(left, right)
+        return 2e-9 * SIZE * HIDDEN[0] * HIDDEN[1]
+
+    ways = {"ours": goal_updates(setup), "compiled": compiled, name: sb3_updates(setup)}
+    found = rates({**ways, "core": product}, runs)
+    labels = ("learner", case, "updates/s")
+    work = goal_flops(setup) / 1e9
+    pairs = zip(found["compiled"], found["core"], strict=True)
+    shares = [work * ours / core for ours, core in pairs]
+    whole = ("learner", f"{case}, compiled", "updates/s")
+    return [
+        compared(labels, found["ours"], name, found[name]),
+        compared(whole, found["compiled"], name, found[name], Bound(1.5)),
+        single(("learner", case, "of the core's matrix rate"), shares, Bound(0.7)),
+    ]
+
+
+def goal_updates(setup: Setup, *, compiled: bool = False) -> Work:
+    """Updates with all that is drawn for them."""
+    made = setup.agent.learner(setup.task, 0, "cpu", compiled=compiled)
+    rng = {stream: np.random.default_rng(i) for i, stream in enumerate(made.streams)}
+    made.insert(played(setup, EPISODES), rng)
+
+    def work() -> int:
+        made.update(0.0, rng)
+        return 1
+
+    for _ in range(goal_config(setup).actor_delay):  # with the actor and without: both forms
+        work()
+
+    return work
+
+
+def goal_flops(setup: Setup) -> float:
+    """Of the matrix products in TD3's update, the actor's share of those in which it learns."""
+    config = goal_config(setup)
+    made: Any = setup.agent.learner(setup.task, 0, "cpu")
+    inner = sum(a * b for a, b in pairwise(config.hidden))
+
+    def layers(inputs: int, outputs: int) -> int:
+        return 2 * (inputs * config.hidden[0] + inner + config.hidden[-1] * outputs)
+
+    critic, actor = layers(made.size + made.actions, 1), layers(made.size, made.actions)
+    # Forward is one, backward two more; targets go forward only.
+    critics = 2 * critic * 3 + 2 * critic + actor
+    return float(config.batch_size) * (critics + 3 * (actor + critic) / config.actor_delay)
+
+
+def sb3_updates(setup: Setup) -> Work:
+    """Stable-Baselines3's TD3 with hindsight, of the same sizes."""
+    config = goal_config(setup)
+    library: Any = importlib.import_module("stable_baselines3")
+    model = library.TD3(
+        "MultiInputPolicy",
+        gymnasium.make(still.ID, disable_env_checker=True),
+        batch_size=config.batch_size,
+        buffer_size=EPISODES * still.STEPS,
+        learning_starts=EPISODES * still.STEPS,
+        policy_kwargs={"net_arch": list(config.hidden)},
+        replay_buffer_class=library.HerReplayBuffer,
+        seed=0,
+        device="cpu",
+    )
+    model.learn(EPISODES * still.STEPS)
+
+    def work() -> int:
+        model.train(gradient_steps=1, batch_size=config.batch_size)
+        return 1
+
+    return work
 
 
 def measure_gpu(runs: int) -> list[Row]:
