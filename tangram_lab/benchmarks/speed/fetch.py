@@ -30,6 +30,7 @@ from tangram_core.errors import ConfigError, TangramError
 from tangram_lab.benchmarks.measure import Row, told
 from tangram_lab.benchmarks.setups import goal_config, robot
 from tangram_lab.benchmarks.trainings import start_training
+from tangram_lab.figures import COLOURS, legend_below, new_figure, save
 
 STAGE, LIBRARY = "fetch", "stable_baselines3"
 TASKS = (
@@ -84,7 +85,7 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
 
     Args:
         matches: what to train.
-        rows: CSV file that gets every test as soon as a match is over.
+        rows: CSV file that gets every test as soon as a match is over, beside a picture of all.
 
     Raises:
         ConfigError: `rows` has other columns.
@@ -105,7 +106,24 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
         there = pd.concat([there, made]) if len(there) else made
         if rows is not None:
             there.to_csv(rows, index=False)
+            draw(there, name, rows.with_suffix(".png"))
     return [row for match in matches for row in _rows(match, there, name)]
+
+
+def draw(table: pd.DataFrame, name: str, path: Path) -> None:
+    """Success against minutes, a panel for each environment, a line for each training."""
+    ids = list(dict.fromkeys(table["id"]))
+    figure, panels = new_figure(2.6, len(ids), sharey=True)
+    for id, panel in zip(ids, panels, strict=True):  # noqa: A001
+        trainings = [one for _, one in table[table["id"] == id].groupby(["agent", "seed"])]
+        for side, who, colour in zip(("", "their_"), ("ours", name), COLOURS, strict=False):
+            for number, one in enumerate(trainings):
+                minutes, label = one[f"{side}train_s"] / 60.0, who if number == 0 else None
+                panel.plot(minutes, one[f"{side}success"], color=colour, label=label)
+        panel.set(title=id, xlabel="minutes", ylim=(0.0, 1.02))
+    panels[0].set_ylabel("success")
+    legend_below(figure, panels[0])
+    save(figure, path)
 
 
 def _columns() -> list[str]:
