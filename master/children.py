@@ -49,7 +49,7 @@ class Child:
     next_start_s: float | None = 0.0
     body: Body = run_command
     _process: ForkServerProcess | None = field(default=None, init=False)
-    _handle: int | None = field(default=None, init=False)  # None, too, where it has just ended
+    _handle: int | None = field(default=None, init=False)
     _lifeline: Lifeline | None = field(default=None, init=False)
     _started_s: float = field(default=0.0, init=False)
     _frozen_s: float = field(default=0.0, init=False)
@@ -72,27 +72,22 @@ class Child:
         """
         self.next_start_s, self._started_s, self._frozen_s = None, time.monotonic(), 0.0
         self._lifeline = Lifeline()
+        told = self.body, self.arguments, self.log, self.nice, self._lifeline.read_end
         try:
-            self._process = start(self.body, self.arguments, self.log, self._lifeline.read_end)
+            self._process = start(*told)
         finally:
             self._lifeline.started()
-        pid = self._process.pid or 0
-        with suppress(ProcessLookupError):  # ended already; the waiting thread tells
-            self._handle = os.pidfd_open(pid)
-            if self.nice:
-                nice = os.getpriority(os.PRIO_PROCESS, pid)
-                os.setpriority(os.PRIO_PROCESS, pid, nice + self.nice)
-        handle = None if self._handle is None else os.dup(self._handle)
-        Thread(target=self._wait, args=(handle, ended), daemon=True).start()
+        self._handle = _handle(self._process)
+        Thread(target=self._wait, args=(os.dup(self._handle), ended), daemon=True).start()
 
     def clear(self) -> int:
         """Forget a process that has ended; returns its exit status, 0 where there is none."""
         status = 0
+        if self._lifeline is not None:
+            self._lifeline.cut()
         if self._process is not None:
             self._process.join()
             status = self._process.exitcode or 0
-        if self._lifeline is not None:
-            self._lifeline.cut()
         if self._handle is not None:
             os.close(self._handle)
         self._process, self._handle, self._lifeline = None, None, None
@@ -129,7 +124,7 @@ class Child:
         Returns:
             Whether it was killed.
         """
-        frozen = self._process is not None and _is_stopped(self._process.pid)
+        frozen = self._process is not None and _is_stopped(self._process.pid or 0)
         self._frozen_s = self._frozen_s + passed_s if frozen else 0.0
         if not 0.0 < self.patience_s <= self._frozen_s:
             return False
@@ -138,9 +133,9 @@ class Child:
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal, if the process still runs."""
-        if self._handle is not None:
+        if self._process is not None and self.alive:
             with suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._handle, number)
+                os.kill(self._process.pid or 0, number)
 
     def tail(self, count: int = TAIL_LINES) -> str:
         """The last lines of its log."""
@@ -149,21 +144,30 @@ class Child:
         lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
         return "\n".join(lines[-count:])
 
-    def _wait(self, handle: int | None, ended: Callable[["Child"], None]) -> None:
-        if handle is not None:
-            _has_ended(handle, wait=True)
-            os.close(handle)
+    def _wait(self, handle: int, ended: Callable[["Child"], None]) -> None:
+        _has_ended(handle, wait=True)
+        os.close(handle)
         ended(self)
 
 
+def _handle(process: ForkServerProcess) -> int:
+    """A file that can be read once the process has ended.
+
+    Where the kernel has none (before 5.3), one of its server, whose end looks the same.
+    """
+    try:
+        return os.pidfd_open(process.pid or 0)
+    except OSError:
+        return os.dup(process.sentinel)
+
+
 def _has_ended(handle: int, *, wait: bool) -> bool:
-    """Of a process; its server may be gone."""
     poll = select.poll()
     poll.register(handle, select.POLLIN)
     return bool(poll.poll(None if wait else 0))
 
 
-def _is_stopped(pid: int | None) -> bool:
+def _is_stopped(pid: int) -> bool:
     """Whether there is such a process, and a signal has stopped it."""
     try:
         return psutil.Process(pid).status() == psutil.STATUS_STOPPED

@@ -8,11 +8,10 @@ import multiprocessing
 import os
 import signal
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -24,6 +23,7 @@ from tangram_core.errors import TangramError
 from tangram_core.run.process import VARIABLE
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+SAFE_PATH = "PYTHONSAFEPATH"  # of the server, which must not find the modules of a user first
 ROOT = Path(__file__).resolve().parent.parent
 # A whole job may get these: the server outlasts them, and its forks take what came meanwhile.
 HELD_BACK = {*SIGNALS, SUBMITIT}
@@ -45,8 +45,22 @@ def run_command(arguments: Sequence[str]) -> int:
     return status
 
 
+def warm_up() -> None:
+    """Start the server, unless it runs, and wait until it can fork.
+
+    It has this process's environment. Errors are those of `start`, which meets them again.
+    """
+    with Path(os.devnull).open() as nothing, suppress(TangramError):
+        start(run_nothing, ["nothing"], None, 0, nothing.fileno()).join()
+
+
+def run_nothing(_: Sequence[str]) -> int:
+    """End well."""
+    return 0
+
+
 def start(
-    body: Body, arguments: Sequence[str], log: Path | None, read_end: int
+    body: Body, arguments: Sequence[str], log: Path | None, nice: int, read_end: int
 ) -> ForkServerProcess:
     """Start a process in a session of its own.
 
@@ -54,6 +68,7 @@ def start(
         body: what it runs.
         arguments: of that, also its title, as `ps` shows it.
         log: file that its output is appended to, None for the terminal.
+        nice: added to its niceness.
         read_end: of its lifeline.
 
     Raises:
@@ -61,25 +76,42 @@ def start(
     """
     _context.set_forkserver_preload(["tangram_cli.forkserver"])
     with Connection(os.dup(read_end), writable=False) as lifeline:
-        process = _context.Process(target=_become, args=(body, arguments, log, lifeline))
+        process = _context.Process(target=_become, args=(body, arguments, log, nice, lifeline))
         try:
-            with _environment():
-                forkserver.ensure_running()
+            _ensure_server()
             process.start()
         except (EOFError, OSError) as error:
-            folder = tempfile.gettempdir()
             raise TangramError(
-                f"no process can be started ({error}): is {folder} (TMPDIR) a short path that can "
-                "be written to, and is memory left?"
+                f"no process can be started ({error}): is TMPDIR, or /tmp, a short path that can "
+                "be written to, is the current folder still there, and is memory left?"
             ) from error
     return process
 
 
-def _become(body: Body, arguments: Sequence[str], log: Path | None, lifeline: Connection) -> None:
+def _ensure_server() -> None:
+    """With signals held back from its first moment on, and our environment."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, HELD_BACK)
+    try:
+        resource_tracker.ensure_running()  # the server's companion; it lets some signals in again
+        signal.pthread_sigmask(signal.SIG_BLOCK, HELD_BACK)
+        with _environment():
+            forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _become(
+    body: Body, arguments: Sequence[str], log: Path | None, nice: int, lifeline: Connection
+) -> None:
     """In the child."""
     # Ctrl-C reaches the whole terminal; the parent decides who ends when.
     os.setsid()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, HELD_BACK)
+    os.nice(nice)
+    # As in a process of its own: what plug-ins may use, and what theirs inherit.
+    import_module("numpy").random.seed()
+    multiprocessing.set_start_method(None, force=True)
+    del os.environ[SAFE_PATH]
     _redirect(os.open(os.devnull, os.O_RDONLY), 0)
     if log is not None:
         try:
@@ -115,4 +147,5 @@ def environment() -> dict[str, str]:
     if (ROOT / "pyproject.toml").exists():  # a source tree, which need not be installed
         paths = [variables.get("PYTHONPATH", ""), str(ROOT)]
         variables["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
-    return variables | {"PYTHONUNBUFFERED": "1", "PYTHONSAFEPATH": "1"}
+    # SPT_NOENV: /proc tells the environment of children, for which their titles are cut.
+    return variables | {"PYTHONUNBUFFERED": "1", SAFE_PATH: "1", "SPT_NOENV": "1"}

@@ -7,10 +7,12 @@ import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import Any
 
 from master.children import MAX_RESTARTS, Child, describe
 from master.config import MasterConfig
+from master.forking import warm_up
 from master.hub.security import listening_place
 from master.record.resumable import check_resumable
 from master.record.rundir import RunFolder
@@ -97,6 +99,12 @@ class Launcher:
 
     def run(self) -> int:
         """Run until the master has ended; returns the exit status for the user."""
+        starting = Thread(target=warm_up, daemon=True)
+        starting.start()
+        while starting.is_alive():  # it takes seconds, minutes from a slow disk
+            event = self._next_event()
+            if isinstance(event, signal.Signals):
+                return 128 + event
         self._master.start(self._events.put)
         while True:
             self._start_due()

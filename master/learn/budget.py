@@ -60,12 +60,12 @@ class Rates:
         self._first: tuple[float, float] | None = None
 
     def mark(
-        self, now_s: float, transitions: int, updates: int, share: float, learning_s: float
+        self, now_s: float, transitions: int, updates: int, share: float, busy_s: float
     ) -> None:
-        """Note the counters at a time of a steady clock."""
+        """Note the counters at a time of a steady clock, and the processor time until then."""
         if self._first is None:
             self._first = (now_s, share)
-        self._marks.append((now_s, transitions, updates, share, learning_s))
+        self._marks.append((now_s, transitions, updates, share, busy_s))
         while len(self._marks) > 2 and now_s - self._marks[1][0] >= self.window_s:
             self._marks.popleft()
 
@@ -77,9 +77,9 @@ class Rates:
         """Updates per second."""
         return self._rate(2)
 
-    def updates_per_busy_s(self) -> float:
-        """Updates per second of learning: what it would be if nothing were waited for."""
-        return self._rate(2, of=4)
+    def transitions_per_busy_s(self) -> float:
+        """Transitions per second of the processor: what it would be if nothing were waited for."""
+        return self._rate(1, of=4)
 
     def left_s(self) -> float | None:
         """Seconds until the budget is used, at the pace since the start; None when unknown."""

@@ -1,6 +1,5 @@
 """What learns, without sockets: the agent's learner, the rate limiter, and their state."""
 
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -45,7 +44,6 @@ class Trainer:
             self.pace.updates_per_transition, self.pace.learning_starts, lag_updates
         )
         self.episodes = 0
-        self.learning_s = 0.0
         self._generators = {
             name: np.random.default_rng([seed, stream])
             for stream, name in enumerate(self.learner.streams)
@@ -75,9 +73,7 @@ class Trainer:
 
     def update(self, share: float) -> dict[str, float]:
         """One update, at the used share of the budget; returns its losses."""
-        begun_s = time.perf_counter()
         losses = self.learner.update(share, self._generators)
-        self.learning_s += time.perf_counter() - begun_s
         self.rate_limiter.updated()
         return losses
 

@@ -63,8 +63,8 @@ class StatusCollector:
     def mark(self) -> None:
         """Note the counters, from which rates follow; a few times in a second."""
         trainer, share = self._guard.trainer, self._budget.share
-        now_s, learning_s = time.monotonic(), trainer.learning_s
-        self._rates.mark(now_s, trainer.transitions, trainer.updates, share, learning_s)
+        now_s, busy_s = time.monotonic(), time.thread_time()
+        self._rates.mark(now_s, trainer.transitions, trainer.updates, share, busy_s)
 
     def collect(self, queue: int, each: bool = True) -> RunStatus:
         """The present state.
@@ -116,12 +116,10 @@ class StatusCollector:
 
     def _balance(self) -> dict[str, float]:
         """Transitions per second if no player ever waited, and if the learner never did."""
-        trainer, limiter = self._guard.trainer, self._guard.trainer.rate_limiter
-        played = trainer.transitions / max(limiter.transitions, 1)  # for each that counts
-        learned = self._rates.updates_per_busy_s() / trainer.pace.updates_per_transition
+        trainer = self._guard.trainer
         return {
             "could_play": could_play(self._hub.peers, trainer.setup.spec.horizon),
-            "could_learn": learned * played,
+            "could_learn": self._rates.transitions_per_busy_s() if trainer.updates else 0.0,
         }
 
 

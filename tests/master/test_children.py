@@ -84,9 +84,10 @@ def test_a_child_has_its_own_session_niceness_thread_and_log(
     tmp_path: Path,
 ) -> None:
     code = (
-        "import os, json, psutil; assert not os.read(0, 1); "
+        "import os, json, psutil, sys; assert not os.read(0, 1); "
         "print(json.dumps([os.getsid(0) == os.getpid(), os.environ['OMP_NUM_THREADS'], "
-        "psutil.Process().cmdline()[0][:7]])); raise SystemExit(7)"
+        "psutil.Process().cmdline()[0][:7], {'torch', 'master.run'} <= sys.modules.keys()])); "
+        "raise SystemExit(7)"
     )
     made = child("worker 0", code, tmp_path / "log")
     ended: SimpleQueue[Child] = SimpleQueue()
@@ -95,7 +96,7 @@ def test_a_child_has_its_own_session_niceness_thread_and_log(
         assert ended.get(timeout=LIMIT_S) is made
         assert made.clear() == 7
         assert [json.loads(line) for line in made.tail().splitlines()] == [
-            [True, environment()["OMP_NUM_THREADS"], "tangram"]
+            [True, environment()["OMP_NUM_THREADS"], "tangram", True]
         ] * lives
     assert not made.alive
     (tmp_path / "log").unlink()

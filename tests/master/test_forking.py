@@ -10,7 +10,8 @@ import psutil
 import pytest
 
 from master.children import Child
-from master.forking import HELD_BACK
+from master.forking import HELD_BACK, warm_up
+from tangram_core.errors import TangramError
 from tests.bodies import run_code
 
 pytestmark = pytest.mark.cluster
@@ -44,6 +45,17 @@ def test_signals_to_a_whole_job_end_its_children_and_leave_the_server() -> None:
     assert server() == before
     first.signal(signal.SIGKILL)
     assert first.clear() == -signal.SIGKILL
+
+
+def test_a_server_that_cannot_start_is_told_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails() -> None:
+        raise OSError("AF_UNIX path too long")
+
+    monkeypatch.setattr(forkserver, "ensure_running", fails)
+    warm_up()  # leaves it to the first start
+    told = r"no process can be started \(AF_UNIX path too long\): is TMPDIR, or /tmp, a short path"
+    with pytest.raises(TangramError, match=told):
+        waiting(SimpleQueue())
 
 
 def test_children_outlive_a_killed_server_and_others_can_be_started() -> None:

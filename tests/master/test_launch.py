@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Event
 
 import pytest
 
@@ -305,6 +306,19 @@ def test_a_worker_whose_end_was_not_heard_of_yet_is_not_given_up(tmp_path: Path)
     assert not made._failed
     made._worker_ended(made._players[0])
     assert made._players[0].restarts == 1
+
+
+@pytest.mark.cluster
+def test_a_signal_while_everything_is_imported_ends_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, imported = launcher(tmp_path), Event()
+    monkeypatch.setattr(launch_module, "warm_up", imported.wait)
+    made._events.put(signal.SIGTERM)
+    (tmp_path / "news").touch()
+    assert finish(made, tmp_path) == (128 + signal.SIGTERM, "")
+    assert not made._master.kept or made._master.next_start_s == 0.0  # it was never started
+    imported.set()
 
 
 @pytest.mark.cluster

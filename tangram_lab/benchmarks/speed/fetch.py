@@ -14,9 +14,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ import torch
 
 from master.watch.result import commit
 from tangram_core.errors import ConfigError, TangramError
+from tangram_core.store.files import write_whole
 from tangram_lab.benchmarks.measure import Row, told
 from tangram_lab.benchmarks.setups import goal_config, robot
 from tangram_lab.benchmarks.trainings import start_training
@@ -89,12 +91,17 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
 
     Raises:
         ConfigError: `rows` has other columns.
+        ModuleNotFoundError: Stable-Baselines3 or the environments are missing.
     """
-    name = label()
-    there = _read(rows)
+    name, there = label(), _read(rows)
+    for module in {match.module for match in matches}:
+        if find_spec(module) is None:
+            raise ModuleNotFoundError(
+                f"{module} is missing: pip install 'tangram-rl[robotics]', or name an id= without"
+            )
     for match in matches:
-        key = {"id": match.id, "seed": match.seed, "agent": match.agent}
-        if not _of(there, key).empty:
+        key = asdict(match)
+        if not _of(there, match).empty:
             print(f"{match.id}, seed {match.seed}: is in {rows}", file=sys.stderr)
             continue
         ours, theirs = _play(match, name)
@@ -105,7 +112,7 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
         )
         there = pd.concat([there, made]) if len(there) else made
         if rows is not None:
-            there.to_csv(rows, index=False)
+            write_whole(rows, there.to_csv(index=False).encode())
             draw(there, name, rows.with_suffix(".png"))
     return [row for match in matches for row in _rows(match, there, name)]
 
@@ -118,8 +125,8 @@ def draw(table: pd.DataFrame, name: str, path: Path) -> None:
         trainings = [one for _, one in table[table["id"] == id].groupby(["agent", "seed"])]
         for side, who, colour in zip(("", "their_"), ("ours", name), COLOURS, strict=False):
             for number, one in enumerate(trainings):
-                minutes, label = one[f"{side}train_s"] / 60.0, who if number == 0 else None
-                panel.plot(minutes, one[f"{side}success"], color=colour, label=label)
+                minutes, legend = one[f"{side}train_s"] / 60.0, who if number == 0 else None
+                panel.plot(minutes, one[f"{side}success"], color=colour, label=legend)
         panel.set(title=id, xlabel="minutes", ylim=(0.0, 1.02))
     panels[0].set_ylabel("success")
     legend_below(figure, panels[0])
@@ -127,7 +134,8 @@ def draw(table: pd.DataFrame, name: str, path: Path) -> None:
 
 
 def _columns() -> list[str]:
-    return ["id", "seed", "agent", "commit", *COLUMNS, *(f"their_{one}" for one in COLUMNS)]
+    match = [field.name for field in fields(Match)]
+    return [*match, "commit", *COLUMNS, *(f"their_{one}" for one in COLUMNS)]
 
 
 def _read(rows: Path | None) -> pd.DataFrame:
@@ -139,13 +147,14 @@ def _read(rows: Path | None) -> pd.DataFrame:
     return found
 
 
-def _of(table: pd.DataFrame, key: dict[str, Any]) -> pd.DataFrame:
+def _of(table: pd.DataFrame, match: Match) -> pd.DataFrame:
+    key = asdict(match)
     return table[(table[list(key)] == list(key.values())).all(axis=1)]
 
 
 def _rows(match: Match, table: pd.DataFrame, name: str) -> list[Row]:
     case = f"{match.id}, {match.agent}, seed {match.seed}"
-    found = _of(table, {"id": match.id, "seed": match.seed, "agent": match.agent})
+    found = _of(table, match)
 
     def row(what: str, unit: str, column: Callable[[str], float]) -> Row:
         pair = column(""), column("their_")
@@ -225,8 +234,9 @@ def _ours(match: Match, folder: Path, cores: list[int]) -> Curve:
 def train(match: Match, cores: Sequence[int]) -> None:
     """Train, and print each test; what they take does not count."""
     library = importlib.import_module(LIBRARY)
-    common = partial(lambda name: importlib.import_module(f"{LIBRARY}.common.{name}"))
-    vector, alone = common("vec_env"), len(cores) == 1
+    vector, alone = importlib.import_module(f"{LIBRARY}.common.vec_env"), len(cores) == 1
+    noise = importlib.import_module(f"{LIBRARY}.common.noise")
+    logger = importlib.import_module(f"{LIBRARY}.common.logger")
     count = ENVS if alone else len(cores)
     kind = vector.DummyVecEnv if alone else vector.SubprocVecEnv
     env = vector.VecNormalize(
@@ -237,7 +247,7 @@ def train(match: Match, cores: Sequence[int]) -> None:
     model = library.TD3(
         "MultiInputPolicy",
         env,
-        action_noise=common("noise").NormalActionNoise(np.zeros(size), np.full(size, NOISE)),
+        action_noise=noise.NormalActionNoise(np.zeros(size), np.full(size, NOISE)),
         batch_size=same.batch_size,
         buffer_size=1_000_000,
         device="auto",
@@ -252,7 +262,7 @@ def train(match: Match, cores: Sequence[int]) -> None:
         tau=1.0 - same.polyak,
         train_freq=(round(1.0 / same.updates_per_transition), "step"),
     )
-    model.set_logger(common("logger").Logger(None, []))
+    model.set_logger(logger.Logger(None, []))
     test, begun, due = _make(match), time.perf_counter(), LOOK_S
 
     def look(*_: object) -> bool:

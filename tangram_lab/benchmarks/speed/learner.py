@@ -33,21 +33,22 @@ HIDDEN, SIZE, EPISODES = [256, 256, 256], 256, 320
 
 def measure_learner(runs: int) -> list[Row]:
     """Updates per second on one core, compiled, against single operations that do the same."""
+    name = label()  # what the goal agent is compared with is missed at once
     cases = [("perceptron [64, 64]", preset("mlp"), 256, 2.3)]
     cases += [("ours", preset(), size, 1.5) for size in BATCHES]
     cases += [("ours, 7 tokens", several(7), BATCHES[0], 1.5)]
     rows = []
-    for name, setup, size, least in cases:
+    for one, setup, size, least in cases:
         made = with_agent(setup, batch_size=size)
         whole = updates(made, learner(made, compiled=True))
-        given = ("learner", f"{name}, batch {size}, compiled", "updates/s"), whole
+        given = ("learner", f"{one}, batch {size}, compiled", "updates/s"), whole
         rows.append(compare(*given, ("single operations", updates(made)), runs, Bound(least)))
-    return [*rows, *_goal_rows(runs)]
+    return [*rows, *_goal_rows(runs, name)]
 
 
-def _goal_rows(runs: int) -> list[Row]:
+def _goal_rows(runs: int, name: str) -> list[Row]:
     """The goal agent with what it draws, beside Stable-Baselines3 and what the core can do."""
-    name, case = label(), f"goal agent {HIDDEN}, batch {SIZE}"
+    case = f"goal agent {HIDDEN}, batch {SIZE}"
     sizes = f"agent.hidden={HIDDEN}", f"agent.batch_size={SIZE}"
     setup = robot(still.ID, still.__name__, "agent=goal", *sizes)
     compiled = goal_updates(setup, compiled=True)

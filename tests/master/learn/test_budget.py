@@ -65,7 +65,7 @@ def test_rates_over_a_window() -> None:
         rates.mark(second, 2000 + 1000 * passed, 20 + 10 * passed, second / 100, second / 5)
     assert rates.transitions_per_s() == pytest.approx(1000.0)
     assert rates.updates_per_s() == pytest.approx(10.0)
-    assert rates.updates_per_busy_s() == pytest.approx(50.0)
+    assert rates.transitions_per_busy_s() == pytest.approx(5000.0)
     assert rates.left_s() == pytest.approx(60.0)
 
 
