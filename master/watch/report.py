@@ -115,7 +115,7 @@ class StatusCollector:
         return RunStatus(numbers, texts, _workers(self._hub.peers if each else (), trainer.updates))
 
     def _balance(self) -> dict[str, float]:
-        """Transitions per second if no player ever waited, and if the learner never did."""
+        """Transitions per second if each process had a core and never waited."""
         trainer = self._guard.trainer
         return {
             "could_play": could_play(self._hub.peers, trainer.setup.spec.horizon),
@@ -141,9 +141,9 @@ def activity(trainer: Trainer, players: int) -> str:
 
 
 def could_play(peers: Iterable[Peer], horizon: int) -> float:
-    """Transitions per second of all players together, if none ever waited; 0 while unknown."""
+    """Transitions per second of all players, each with a core and never waiting; 0: unknown."""
     told = [peer.stats for peer in peers if peer.role == "player"]
-    found = [(one.get("episodes", 0.0), one.get("playing_s", 0.0)) for one in told]
+    found = [(one.get("episodes", 0.0), one.get("busy_s", 0.0)) for one in told]
     rates = [episodes / seconds for episodes, seconds in found if seconds > 0.0]
     return horizon * sum(rates) * len(told) / max(len(rates), 1)
 

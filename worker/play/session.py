@@ -121,9 +121,13 @@ class _Lines(logging.StreamHandler[TextIO]):
 class Report:
     """What a player tells its log: that it waits, and every now and then how fast it plays."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._totals = {"episodes": 0.0, "playing_s": 0.0}
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        processor: Callable[[], float] = time.process_time,
+    ) -> None:
+        self._clock, self._processor = clock, processor
+        self._begun_s, self._total = processor(), 0
         self._begin()
 
     def _begin(self) -> None:
@@ -148,15 +152,14 @@ class Report:
         """Count episodes; a line when it is time.
 
         Returns:
-            Episodes since the start, and seconds without those of waiting.
+            Episodes since the start, and the seconds of a processor that they took.
         """
         self._episodes += episodes
+        self._total += episodes
+        totals = {"episodes": float(self._total), "busy_s": self._processor() - self._begun_s}
         passed = self._clock() - self._since
-        now = {"episodes": self._episodes, "playing_s": passed - self._waited}
-        totals = {name: value + now[name] for name, value in self._totals.items()}
         if passed < REPORT_S:
             return totals
-        self._totals = totals
         values = {
             "episodes": self._episodes,
             "seconds": passed,

@@ -70,8 +70,8 @@ def test_who_takes_part_is_told_one_by_one_to_those_who_listen_only(tmp_path: Pa
 def test_what_could_be_played_is_that_of_those_who_told_for_all() -> None:
     hub = FakeHub(MADE, roles=["player"] * 3 + ["evaluator"])
     assert could_play(hub.peers, horizon=10) == 0.0
-    told = [{"episodes": 100.0, "playing_s": 50.0}, {"episodes": 8.0, "playing_s": 2.0}, {}]
-    for peer, stats in zip(hub.peers, [*told, {"episodes": 9.0, "playing_s": 1.0}], strict=True):
+    told = [{"episodes": 100.0, "busy_s": 50.0}, {"episodes": 8.0, "busy_s": 2.0}, {}]
+    for peer, stats in zip(hub.peers, [*told, {"episodes": 9.0, "busy_s": 1.0}], strict=True):
         peer.stats = stats
     assert could_play(hub.peers, horizon=10) == 10 * (2.0 + 4.0) / 2 * 3
 
