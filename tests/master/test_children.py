@@ -106,8 +106,13 @@ def test_a_child_has_its_own_session_niceness_thread_and_log(
     assert made.clear() == 7
     (tmp_path / "log").rmdir()
 
-    polite = child("polite", "import signal; signal.pause()", tmp_path / "log", nice=3)
+    polite = child(
+        "polite", "import signal; print(1, flush=True); signal.pause()", tmp_path / "log", nice=3
+    )
     polite.start(ended.put)
+    end = time.monotonic() + LIMIT_S
+    while not polite.tail():
+        assert time.monotonic() < end
     assert polite._process is not None
     nice = os.getpriority(os.PRIO_PROCESS, polite._process.pid)
     assert nice == min(os.getpriority(os.PRIO_PROCESS, 0) + 3, 19)
