@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from collections.abc import Iterator
 from multiprocessing import forkserver
 from queue import SimpleQueue
 
@@ -28,6 +29,13 @@ def waiting(ended: "SimpleQueue[Child]") -> Child:
 
 def server() -> psutil.Process:
     return psutil.Process(forkserver._forkserver._forkserver_pid)
+
+
+@pytest.fixture(autouse=True)
+def nobody_is_left() -> Iterator[None]:
+    yield
+    for one in server().children():
+        one.kill()
 
 
 def test_signals_to_a_whole_job_end_its_children_and_leave_the_server() -> None:
