@@ -10,10 +10,8 @@ from tangram_lab.benchmarks.measure import Row, page, show, write
 from tangram_lab.benchmarks.speed.fetch import TASKS, Match, measure_fetch
 from tangram_lab.benchmarks.speed.learner import measure_gpu, measure_learner
 from tangram_lab.benchmarks.speed.scaling import measure_scaling
-from tangram_lab.benchmarks.speed.wire import measure_wire
 
 STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
-    "wire": lambda given: measure_wire(given.runs),
     "learner": lambda given: measure_learner(given.runs),
     "scaling": lambda given: measure_scaling(given.runs),
     "fetch": lambda given: measure_fetch(_matches(given), given.rows),
@@ -28,7 +26,7 @@ def run_stages(given: argparse.Namespace) -> int:
     """
     torch.set_num_threads(1)  # both as masters and workers do
     keep_memory()
-    names = ["wire", "learner", "scaling"] if given.kind == "all" else [given.kind]
+    names = ["learner", "scaling"] if given.kind == "all" else [given.kind]
     rows = [row for name in names for row in STAGES[name](given)]
     title, cells = f"{given.kind}: medians, one thread each", [cells_of(row) for row in rows]
     show(title, cells)

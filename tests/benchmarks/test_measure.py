@@ -58,27 +58,31 @@ def bench(*arguments: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
 
 
-@pytest.mark.check
-@pytest.mark.cluster
-def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path: Path) -> None:
-    done = bench("wire", "runs=1", f"out={tmp_path / 'wire.json'}")
-    assert done.returncode == 0, done.stderr
-    assert "bare" in done.stdout
-    content = json.loads((tmp_path / "wire.json").read_text())
+@pytest.mark.fast
+def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = single(("learner", "a perceptron", "updates/s"), [1.0], Bound(least=2.0))
+    monkeypatch.setitem(STAGES, "learner", lambda _: [row])
+    out = tmp_path / "new" / "learner.json"
+    assert run_stages(argparse.Namespace(kind="learner", out=out)) == 0
+    assert "short of the target:\n  learner: a perceptron" in capsys.readouterr().out
+    assert "| learner | a perceptron | updates/s | 1 |" in out.with_suffix(".md").read_text()
+    content = json.loads(out.read_text())
     assert {"command", "commit", "processor", "cores", "versions", "rows"} <= content.keys()
-    assert {row["stage"] for row in content["rows"]} == {"wire"}
+    assert [found["case"] for found in content["rows"]] == ["a perceptron"]
 
 
 @pytest.mark.fast
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("wire runs=0", "runs must be between 1 and 10000, got 0"),
+        ("learner runs=0", "runs must be between 1 and 10000, got 0"),
         ("fetch minutes=0", "minutes must be between 0.01 and 100000, got 0"),
         ("chaos minutes=inf", "minutes must be a finite number, between 0.01 and 100000, got inf"),
         ("chaos minutes=0", "minutes must be between 0.01 and 100000, got 0"),
         ("chaos seed=-1", "seed must be between 0 and"),
-        ("wire out=/", "out=/ cannot be written (it is a folder)"),
+        ("learner out=/", "out=/ cannot be written (it is a folder)"),
     ],
 )
 def test_a_number_out_of_its_bounds_is_refused(

@@ -1,4 +1,4 @@
-"""Rates, each measured in turns with something else: wire, learner, whole trainings.
+"""Rates, each measured in turns with something else: learner, workers, whole trainings.
 
 Start with `learner.py`. `goals.py` trains beside Stable-Baselines3.
 """
