@@ -1,4 +1,4 @@
 """Rates, each measured in turns with something else: learner, workers, whole trainings.
 
-Start with `learner.py`. `goals.py` trains beside Stable-Baselines3.
+Start with `learner.py`. `fetch.py` trains beside Stable-Baselines3.
 """

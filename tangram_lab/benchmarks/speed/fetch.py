@@ -119,10 +119,10 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
 
 def draw(table: pd.DataFrame, name: str, path: Path) -> None:
     """Success against minutes, a panel for each environment, a line for each training."""
-    ids = list(dict.fromkeys(table["id"]))
+    ids, rest = list(dict.fromkeys(table["id"])), [one.name for one in fields(Match)][1:]
     figure, panels = new_figure(2.6, len(ids), sharey=True)
     for id, panel in zip(ids, panels, strict=True):  # noqa: A001
-        trainings = [one for _, one in table[table["id"] == id].groupby(["agent", "seed"])]
+        trainings = [one for _, one in table[table["id"] == id].groupby(rest)]
         for side, who, colour in zip(("", "their_"), ("ours", name), COLOURS, strict=False):
             for number, one in enumerate(trainings):
                 minutes, legend = one[f"{side}train_s"] / 60.0, who if number == 0 else None
