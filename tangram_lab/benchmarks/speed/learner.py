@@ -98,9 +98,10 @@ def goal_flops(setup: Setup) -> float:
         return 2 * (inputs * config.hidden[0] + inner + config.hidden[-1] * outputs)
 
     critic, actor = layers(made.size + made.actions, 1), layers(made.size, made.actions)
-    # Forward is one, backward two more; targets go forward only.
+    # Forward is one, backward two more; targets go forward only, and the actor asks for no gradient
+    # of the critic's weights.
     critics = 2 * critic * 3 + 2 * critic + actor
-    return float(config.batch_size) * (critics + 3 * (actor + critic) / config.actor_delay)
+    return float(config.batch_size) * (critics + (3 * actor + 2 * critic) / config.actor_delay)
 
 
 def sb3_updates(setup: Setup) -> Work:
