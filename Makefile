@@ -107,7 +107,7 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@touch .venv/.installed-run $@
 
 .venv/.installed-dev: pyproject.toml lock.txt
-	@.ci/install .venv dev,docs,human,peers,slurm,studio,video
+	@.ci/install .venv dev,docs,peers,studio,video
 	@touch .venv/.installed-run .venv/.installed-docs .venv/.installed-studio $@
 
 .venv/.installed-browser: .venv/.installed-dev

@@ -5,11 +5,10 @@ from pathlib import Path
 
 from conf.commands import COMMANDS, GROUPS
 from conf.help import choices
-from conf.sweep import SWEEP
 from tangram_core.errors import ConfigError
 
 CFG_KINDS = ("job", "hydra", "all")
-FLAGS = ("--cfg", *SWEEP)
+FLAGS = ("--cfg", "--multirun", "-m")
 OWN_PRESETS = ("--config-dir", "-cd")
 
 

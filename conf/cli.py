@@ -25,9 +25,7 @@ from conf.arguments import (
 from conf.commands import COMMANDS, GROUPS, Plain
 from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of
-from conf.names import hidden, revealed
 from conf.own import with_named_code, without_named_code
-from conf.sweep import LAUNCHER, check_launcher, refuse_lost_job
 from tangram_core.errors import ConfigError, TangramError
 from tangram_core.registry import TASK
 from tangram_core.settings import CONTROL
@@ -83,8 +81,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
             arguments = without_named_code(arguments)
         options = [] if folder is None else [OWN_PRESETS[0], folder]
         _check_presets(folder)
-        sys.argv[1:] = [*options, *hidden(options_first(arguments, config_name), config_name)]
-        check_launcher(sys.argv[1:])
+        sys.argv[1:] = [*options, *options_first(arguments, config_name)]
         return _run(config_name, task, stored, kinds)
     except TangramError as error:
         # What a user gave may hold line breaks and the terminal's control characters.
@@ -156,10 +153,8 @@ def _run(
     def job(config: DictConfig) -> None:
         gc.enable()
         try:
-            statuses.append(_in_sweep(task(_plain(config, stored, config_name))))
+            statuses.append(task(_plain(config, stored, config_name)))
         except (TangramError, OSError, MemoryError) as error:
-            if _is_elsewhere():
-                raise _as_ours(error) from None  # hydra brings it home
             # An exception that hydra sees costs two more lines; an exit passes through it.
             errors.append(_as_ours(error))
             raise SystemExit(USAGE_STATUS) from None
@@ -187,9 +182,6 @@ def _run(
         if not errors:
             raise
         raise errors[0] from None
-    except Exception as error:
-        refuse_lost_job(error)
-        raise
     return max(statuses)
 
 
@@ -204,20 +196,6 @@ def _composed_once(config_name: str, overrides: list[str]) -> "DictConfig":
     with open_dict(config):
         del config["hydra"]
     return config
-
-
-def _is_elsewhere() -> bool:
-    """Whether this is a job of a sweep in a process of its own, perhaps on another machine."""
-    from hydra.core.hydra_config import HydraConfig
-
-    return str(HydraConfig.get().runtime.choices.get(LAUNCHER, "basic")) != "basic"
-
-
-def _in_sweep(status: int) -> int:
-    """An exit status; in a job of a sweep that runs elsewhere a failure is raised instead."""
-    if status and _is_elsewhere():
-        raise TangramError(f"a job of the sweep ended with status {status}: see its log")
-    return status
 
 
 def _as_ours(error: Exception) -> TangramError:
@@ -253,14 +231,12 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
         raise ConfigError(f"cannot resolve the config: {_first_line(error)}") from None
     if missing:
         raise ConfigError(MISSING_HINTS.get(missing[0], f"set {missing[0]}=..., it has no default"))
-    plain = revealed(_mapping(settings), config_name)
+    plain = _mapping(settings)
     in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN and config_name in MAKE_RUNS
     if in_sweep and isinstance(plain.get("run_dir"), str):
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
     overrides = list(HydraConfig.get().overrides.task)
-    if _is_elsewhere():  # a process of its own, which has loaded nothing
-        with_named_code(overrides)
     return with_named_reward(with_run_config(plain, overrides, stored), overrides)
 
 
@@ -280,9 +256,8 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
     alone = not GlobalHydra().is_initialized()
     try:
         with hydra.initialize_config_module("conf", version_base="1.3") if alone else nullcontext():
-            config = hydra.compose(config_name, hidden(overrides, config_name))
-        settings = _mapping(OmegaConf.to_container(config, resolve=True))
-        return revealed(settings, config_name)
+            config = hydra.compose(config_name, list(overrides))
+        return _mapping(OmegaConf.to_container(config, resolve=True))
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_explain(error, config_name, kinds_of(overrides))) from error
 

@@ -147,7 +147,6 @@ def _plain(value: Any) -> Any:
 def _quiet() -> Plain:
     """The commands make their own folders and logs; hydra adds none."""
     return {
-        "job": {"name": "tangram"},  # of the jobs of a sweep that a launcher submits
         "run": {"dir": "."},
         "sweep": {
             "dir": "runs/sweeps/${now:%Y-%m-%d_%H-%M-%S}",
@@ -258,12 +257,11 @@ those that come with tangram-rl or your own, see docs/puzzles.md.""",
 Shows a run. It plays episodes with the newest weights of a run, noise off, and draws them.
 It assembles puzzles: those that come with tangram-rl or your own, see docs/puzzles.md.
 With target=photo.png it assembles what a photograph shows, see docs/pictures.md.
-With silhouette=cat.png it finds how tokens fill an outline first, see docs/silhouettes.md.
-With compare=[...] several runs play the same episodes side by side.""",
+With silhouette=cat.png it finds how tokens fill an outline first, see docs/silhouettes.md.""",
         (
             "tangram-play run_dir=runs/my_run out=tests.png episodes=20",
             "tangram-play puzzle=cat out=cat.gif",
-            "tangram-play compare=[runs/my_run,pretrained/square] out=both.gif episodes=4",
+            "tangram-play silhouette=cat.png out=cat.mp4",
         ),
         ("tangram_game.config:PlayConfig",),
         over=OVER,

@@ -18,15 +18,13 @@ from pathlib import Path
 
 from setproctitle import setproctitle
 
-from master.signals import SIGNALS, SUBMITIT
+from master.signals import SIGNALS
 from tangram_core.errors import TangramError
 from tangram_core.run.process import VARIABLE
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 SAFE_PATH = "PYTHONSAFEPATH"  # of the server, which must not find the modules of a user first
 ROOT = Path(__file__).resolve().parent.parent
-# A whole job may get these: the server outlasts them, and its forks take what came meanwhile.
-HELD_BACK = {*SIGNALS, SUBMITIT}
 # Runs in the process, with its arguments; found again there by its name.
 Body = Callable[[Sequence[str]], int]
 
@@ -89,11 +87,14 @@ def start(
 
 
 def _ensure_server() -> None:
-    """With signals held back from its first moment on, and our environment."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, HELD_BACK)
+    """With our environment, and signals held back from its first moment on.
+
+    A whole job may get these: the server outlasts them, and its forks take what came meanwhile.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         resource_tracker.ensure_running()  # the server's companion; it lets some signals in again
-        signal.pthread_sigmask(signal.SIG_BLOCK, HELD_BACK)
+        signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         with _environment():
             forkserver.ensure_running()
     finally:
@@ -106,7 +107,7 @@ def _become(
     """In the child."""
     # Ctrl-C reaches the whole terminal; the parent decides who ends when.
     os.setsid()
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, HELD_BACK)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     os.nice(nice)
     # As in a process of its own: what plug-ins may use, and what theirs inherit.
     import_module("numpy").random.seed()

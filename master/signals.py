@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM, SIGHUP, SIGUSR1, SIGUSR2: the first asks for a clean end, the second ends."""
+"""SIGINT, SIGTERM, SIGHUP, SIGUSR1: the first asks for a clean end, the second ends."""
 
 import os
 import signal
@@ -10,9 +10,6 @@ from tangram_core.run.outcome import CTRL_C
 from tangram_core.run.process import handling
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
-# submitit's, near a time limit: all processes of a job get it, and tangram-train leaves it to
-# submitit, which queues the job again; the others must end in order meanwhile.
-SUBMITIT = signal.SIGUSR2
 # One wish to end may arrive twice: a time limit signals a process and then its whole group.
 SAME_WISH_S = 1.0
 SHOW_CURSOR = b"\x1b[?25h\n"
@@ -33,7 +30,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.reason: str | None = None
         self._first_s = 0.0
-        self._handling = handling(self._handle, (*SIGNALS, SUBMITIT))
+        self._handling = handling(self._handle, SIGNALS)
 
     def __enter__(self) -> Self:
         self._handling.__enter__()

@@ -10,7 +10,7 @@ export PROJECT RUN_DIR RUN_WITH
 export PATH="$PROJECT/.venv/bin:$PATH"
 
 master=  # process of the srun that runs the master
-code=()  # a reward of one's own: code, which each process is told by name
+code=()  # code of one's own, which each process is told by name
 warned=  # 1 once the time limit is near
 
 say() {
@@ -47,7 +47,9 @@ begin_run() {
 code_of() {
     local setting
     for setting in "$@"; do
-        [[ $setting != reward.name=* ]] || code+=("$setting")
+        case $setting in
+            task=*.py:* | agent=*.py:* | task.imports=* | reward.name=*) code+=("$setting") ;;
+        esac
     done
 }
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Tries every script of this folder on a real SLURM, made on this machine and taken away again.
 #
-#   slurm/try.sh [node] [limit] [sweep]      # all three parts without an argument
+#   slurm/try.sh [node] [limit] [tasks]      # all three parts without an argument
 #
 # Needs Debian and root: it installs slurm-wlm and munge where they are missing (they stay), and runs
 # their daemons with a configuration in a temporary folder; /etc/slurm is left alone. Takes about a
@@ -56,7 +56,7 @@ nothing_left() {
 [[ $EUID -eq 0 ]] || refuse "must run as root: it installs packages and starts daemons"
 [[ -e /etc/debian_version ]] || refuse "must run on Debian: it installs packages with apt-get"
 for part in "$@"; do
-    [[ $part =~ ^(node|limit|sweep)$ ]] || refuse "unknown part '$part': node, limit or sweep"
+    [[ $part =~ ^(node|limit|tasks)$ ]] || refuse "unknown part '$part': node, limit or tasks"
 done
 
 work=$(mktemp -d /tmp/tangram-slurm.XXXXXX)
@@ -65,13 +65,13 @@ trap 'exit 130' INT
 trap 'exit 143' TERM
 
 install_slurm || refuse "cannot install slurm-wlm and munge"
-# The sweep's plugin is in no environment that only `make train` made.
-.venv/bin/python -c 'import hydra_plugins.hydra_submitit_launcher' 2>/dev/null ||
-    .ci/install .venv slurm || refuse "cannot install the extra slurm into .venv"
+# Fetch's environments are in no environment that only `make train` made.
+.venv/bin/python -c 'import gymnasium_robotics' 2>/dev/null ||
+    .ci/install .venv robotics || refuse "cannot install the extra robotics into .venv"
 start_cluster || refuse "SLURM does not start: see $(tail -n 5 "$work"/*.out)"
 echo "$(slurmd -V) on Debian $(</etc/debian_version), two nodes on $(nproc) cores"
 
-for part in "${@:-node limit sweep}"; do
+for part in "${@:-node limit tasks}"; do
     for name in $part; do
         "try_$name"
     done

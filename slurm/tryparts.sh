@@ -192,28 +192,28 @@ none_queued() { # JOB
     [[ -z $(squeue --noheader --jobs="$1" 2>/dev/null) ]]
 }
 
-# submitit asks the accounting, which this SLURM has not, and goes by the files of its jobs then.
-sweep() { # RUN_DIR
-    .venv/bin/tangram-train --multirun hydra/launcher=submitit_slurm \
-        hydra.sweep.dir="$work/submitit" hydra.launcher.cpus_per_task=2 \
-        hydra.launcher.timeout_min=30 hydra.launcher.array_parallelism=2 \
-        run_dir="$1" seed=0,1,2 agent=quick,tangram sim=kinematic max_updates=40 \
-        agent.learning_starts=64 agent.updates_per_transition=0.1 "${TINY[@]}" \
-        >"$work/sweep.log" 2>&1 || { tail "$work/sweep.log"; return 1; }
-}
-
-report() { # RUN_DIR
+report() { # RUNS
     .venv/bin/tangram-report runs="$1" out="$work/report" >/dev/null
 }
 
-# Seeds and agents as jobs of one sweep, and one table of them.
-try_sweep() {
-    local out=$work/sweep
-    held "tangram-train --multirun: every job of the sweep ended well" sweep "$out"
-    held "a sweep of 3 seeds and 2 agents left six complete runs" \
-        test "$(grep -l '"ended_by": "max_updates=40"' "$out"/*/result.json | wc -l)" = 6
+# Seeds as jobs and one table of them; a public task; a task and an agent in files of one's own.
+try_tasks() {
+    local out=$work/seeds gym=$work/gym own=$work/own seed
+    local -a jobs=() short=(max_updates=40 agent.learning_starts=64 "${TINY[@]}")
+    for seed in 0 1 2; do
+        jobs+=("$(submit "$out/$seed" --ntasks=3 slurm/train.sbatch seed="$seed" sim=kinematic "${short[@]}")")
+    done
+    jobs+=("$(submit "$gym" --ntasks=3 slurm/train.sbatch task=gym task.id=FetchPush-v4 \
+        task.imports=[gymnasium_robotics] max_updates=40 "${TINY[@]}")")
+    jobs+=("$(submit "$own" --ntasks=3 slurm/train.sbatch task=docs/examples/point.py:Point \
+        agent=docs/examples/td3.py:TD3 max_updates=40 "${TINY[@]}")")
+    await_end "${jobs[@]}"
+    held "three jobs of three seeds reached their bound" \
+        test "$(grep -l '"ended_by": "max_updates=40"' "$out"/*/result.json | wc -l)" = 3
     held "tangram-report made one table of them" report "$out"
     grep -E '^\| (training|.* 3 of 3) ' "$work/report/tables.md" | sed 's/^/  /' || true
-    held "each agent stands there with three seeds" \
-        test "$(grep -cE '^\| .*\| 3 of 3 \|' "$work/report/tables.md")" = 2
+    held "three seeds stand there" \
+        test "$(grep -cE '^\| .*\| 3 of 3 \|' "$work/report/tables.md")" = 1
+    held "task=gym task.id=FetchPush-v4: the run reached its bound" result_is "$gym" max_updates=40
+    held "a task and an agent of one's own: the run reached its bound" result_is "$own" max_updates=40
 }

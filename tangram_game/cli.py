@@ -4,7 +4,6 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 instant.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +34,7 @@ def _evaluate(settings: Plain) -> int:
     for name, path in (("out", config.out), ("sheet", config.sheet)):
         if path is not None:
             check_writable(name, Path(path))
-    _check_played([config.run], config)
+    _check_played(config)
     tell(f"loads and plays {config.run}")
 
     from tangram_game.evaluate import evaluate_run
@@ -46,46 +45,40 @@ def _evaluate(settings: Plain) -> int:
 def _play(settings: Plain) -> int:
     from tangram_core.setup import from_mapping
     from tangram_core.store.files import check_writable
-    from tangram_game.config import PlayConfig, check_compare
+    from tangram_game.config import PlayConfig
 
-    check_compare(settings.get("compare"))  # before a text is taken for a list of letters
     paths = with_absolute_paths(settings)
     config = from_mapping(PlayConfig, with_changes(paths))
     check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
-    stored = _check_played(config.run_dirs, config)
+    stored = _check_played(config)
     if config.target is not None:
         from tangram_game.figures.photographs import read_photograph
 
-        read_photograph(config.target, stored[0].task)
+        read_photograph(config.target, stored.task)
     filled = None
     if config.silhouette is not None:
         from tangram_game.figures.silhouettes import read_silhouette
 
         out = Path(config.out)
-        filled = read_silhouette(config.silhouette, stored[0].task, config.solutions, out)
-    tell(f"loads and plays {', '.join(config.run_dirs)}")
-
-    if config.compare is not None:
-        from tangram_game.play import compare_runs
-
-        return compare_runs(config)
+        filled = read_silhouette(config.silhouette, stored.task, config.solutions, out)
+    tell(f"loads and plays {config.run}")
     from tangram_game.play import play_run
 
     return play_run(config, filled)
 
 
-def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Run"]:
-    """Refuse what cannot be played before torch is loaded; returns what the runs play."""
+def _check_played(config: "EvalConfig | PlayConfig") -> "Run":
+    """Refuse what cannot be played before torch is loaded; returns what the run plays."""
     from tangram_agent.runs import read_changed
 
-    stored = [read_changed(run_dir, config.changes) for run_dir in run_dirs]
+    stored = read_changed(config.run, config.changes)
     if config.puzzle is not None:
         from tangram_game.config import source_and_names
         from tangram_game.figures.puzzles import find_figures
 
         source, names = source_and_names(config.puzzle)
-        find_figures(source, stored[0].task, names)
+        find_figures(source, stored.task, names)
     return stored
 
 
@@ -125,8 +118,6 @@ def with_absolute_paths(settings: Plain) -> Plain:
     if puzzle is not None and is_puzzle_source(puzzle[0]) and puzzle[0] not in SPLITS:
         puzzle = (str(_absolute(puzzle[0], is_run=False)), *puzzle[1:])
     result["puzzle"] = puzzle
-    if isinstance(result.get("compare"), list):
-        result["compare"] = [_absolute(run, is_run=True) for run in result["compare"]]
     return {name: value for name, value in result.items() if name in settings}
 
 

@@ -21,7 +21,6 @@ MAX_TURNS = 360
 MAX_SOLUTIONS = 20
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
 PICTURES = (".gif", ".mp4", ".png")
-MIN_COMPARED, MAX_COMPARED = 2, 4
 MAX_SEED = 2**63 - 1
 PUZZLE_FILES = (".json", ".svg")
 PUZZLE_HELP = (
@@ -115,25 +114,6 @@ class EvalConfig(Settings):
         return self.run_dir or game_run()
 
 
-def check_compare(value: object) -> None:
-    """Refuse what is no list of a few different run folders; None is none.
-
-    Raises:
-        ConfigError: says how to write one.
-    """
-    if value is None:
-        return
-    runs = list(value) if isinstance(value, list | tuple) else []
-    named = all(isinstance(run, str) and run.strip() for run in runs)
-    if not (named and MIN_COMPARED <= len(runs) <= MAX_COMPARED):
-        raise ConfigError(
-            f"compare must list {MIN_COMPARED} to {MAX_COMPARED} folders of runs, got {value!r}: "
-            "set compare=[runs/a,runs/b]"
-        )
-    if len(set(runs)) < len(runs):
-        raise ConfigError(f"compare must list different runs, got {value!r}: name each one once")
-
-
 def check_puzzle(value: object) -> tuple[str, ...] | None:
     """The names of puzzles, one or a list of some, perhaps behind their file; None is none.
 
@@ -169,16 +149,14 @@ def source_and_names(puzzle: tuple[str, ...]) -> tuple[str | None, tuple[str, ..
 
 @dataclass(frozen=True)
 class PlayConfig(Settings):
-    """Pictures of a run at play (tangram-play), or of several on the same starts.
+    """Pictures of a run at play (tangram-play).
 
     Attributes:
-        changes: settings of sim and agent that are not to be as the runs were trained with.
+        changes: settings of sim and agent that are not to be as the run was trained with.
     """
 
     run_dir: str | None = setting(
-        None,
-        "folder of the run, or an agent that comes with tangram-rl: pretrained/square",
-        only={"compare": None},
+        None, "folder of the run, or an agent that comes with tangram-rl: pretrained/square"
     )
     out: str = setting("play.gif", ".gif or .mp4 for an animation, .png for one picture")
     episodes: int = setting(
@@ -189,21 +167,18 @@ class PlayConfig(Settings):
         only={"puzzle": None, "target": None, "silhouette": None},
     )
     seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
-    compare: tuple[str, ...] | None = setting(
-        None, "folders of 2 to 4 runs, as in [runs/a,runs/b]: all on the same starts"
-    )
-    puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP, only={"compare": None})
+    puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
     target: str | None = setting(
         None,
         "instead of random targets: a photograph of all tokens of the run, PNG or JPEG, dark on "
         "light ground or the reverse, at most three touching",
-        only={"compare": None, "puzzle": None},
+        only={"puzzle": None},
     )
     silhouette: str | None = setting(
         None,
         "instead of random targets: an outline that tells no pieces, a PNG, JPEG, SVG or JSON, or "
         "the name of a puzzle of the library; how the run's tokens fill it is searched first",
-        only={"compare": None, "puzzle": None, "target": None},
+        only={"puzzle": None, "target": None},
     )
     solutions: int = setting(
         1,
@@ -216,8 +191,8 @@ class PlayConfig(Settings):
     changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_compare(self.compare)
-        self._check_one_of_both()
+        figures = (self.puzzle, self.target, self.silhouette)
+        _check_run(self.run_dir, figures != (None, None, None))
         if Path(self.out).suffix not in PICTURES:
             raise ConfigError(
                 f"out must end with {', '.join(PICTURES)}, got '{self.out}': .gif and .mp4 move, "
@@ -239,16 +214,6 @@ class PlayConfig(Settings):
             _check_kept(self.out, "silhouette", self.silhouette)
 
     @property
-    def run_dirs(self) -> tuple[str, ...]:
-        """The runs to show, one or several."""
-        return self.compare or (self.run_dir or game_run(),)
-
-    def _check_one_of_both(self) -> None:
-        if self.run_dir is not None:
-            check_folder("run_dir", self.run_dir)
-        elif self.compare is None and not (
-            (self.puzzle or self.target or self.silhouette) and GAME in agent_names()
-        ):
-            raise ConfigError(
-                "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"
-            )
+    def run(self) -> str:
+        """The run to show."""
+        return self.run_dir or game_run()

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont, ImageOps
+from PIL import Image, ImageDraw, ImageOps
 from rich.console import Console
 
 from tangram_agent.runs import Run, load_changed
 from tangram_core.arrays import Floats
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError
 from tangram_core.run.outcome import plural
-from tangram_core.settings import told
 from tangram_core.store.files import write_whole
 from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names
 from tangram_game.figures.photographs import draw_photograph, read_photograph
@@ -40,13 +39,8 @@ SHOWN = "what the agent is shown"
 SEEN = 30  # frames of what was seen before a film
 SHEET = 720  # pixels across, about
 MIN_TILE, MAX_TILE = 64, 240
-COMPARED = 1080  # pixels across, about, of all runs together
-HEADER = 44  # pixels above a run's episodes
-TITLE, SCORE = 18, 13  # pixels of the header's two lines
-GAP = 24  # pixels between runs
-OF_STARTS = ("targets", "mirrored", "starts")
-_DRAWN_BY = f"sim.arena, {', '.join(OF_STARTS)}"
-PAPER, TEXT, FAINT, RULE = (250, 250, 247), (31, 41, 55), (107, 114, 128), (214, 214, 208)
+GAP = 24  # pixels between pictures
+PAPER, RULE = (250, 250, 247), (214, 214, 208)
 
 
 def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
@@ -64,8 +58,7 @@ def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
         ConfigError: puzzles that the run cannot play.
     """
     torch.set_num_threads(1)
-    (run_dir,) = config.run_dirs
-    run = load_changed(run_dir, config.changes)
+    run = load_changed(config.run, config.changes)
     figures = (config.puzzle, config.target, config.silhouette)
     if isinstance(run.setup.task, Place) or figures != (None, None, None):
         show = make_show(run, config, silhouette)
@@ -267,115 +260,6 @@ def motion(layout: Layout, corners: Floats, count: int) -> list[Floats]:
         for share in shares
     ]
     return [corners[:, 0], *between]
-
-
-def compare_runs(config: PlayConfig) -> int:
-    """Play the same episodes with several runs, noise off, and draw each run's in a column.
-
-    Episodes stand at the same place in every column; a shorter one waits for the others.
-
-    Returns:
-        Exit status 0.
-
-    Raises:
-        RunError: a run that cannot be loaded or has other tokens or another arena than the
-            first, or `out` is not writable.
-    """
-    torch.set_num_threads(1)
-    runs = [load_changed(run_dir, config.changes) for run_dir in config.run_dirs]
-    check_same_task(runs)
-    shown = [(run.task, play_episodes(run, config)) for run in runs]
-    labels = distinct_names([run.folder for run in runs])
-    scores = [f"mean raw overlap {played.overlap.mean():.3f}" for _, played in shown]
-    panels = [
-        [headed(frame, *text) for frame in frames]
-        for frames, *text in zip(_films(config, shown), labels, scores, strict=True)
-    ]
-    frames = [side_by_side(row) for row in zip(*panels, strict=True)]
-    save_picture(config.out, with_stills(frames))
-    line = "; ".join(f"{label}: {score}" for label, score in zip(labels, scores, strict=True))
-    Console(highlight=False).print(
-        f"{config.out}: {plural(config.episodes, 'episode')}; {line}", markup=False, soft_wrap=True
-    )
-    return 0
-
-
-def check_same_task(runs: Sequence[Run]) -> None:
-    """Refuse runs that cannot have the same starts; their agents may differ.
-
-    Raises:
-        RunError: names the run that differs from the first, and in what.
-    """
-    first = runs[0]
-    for run in runs[1:]:
-        here, there = (_drawn_by(one.task) for one in (run, first))
-        for what, other in here.items():
-            if other != there[what]:
-                raise RunError(
-                    f"cannot compare {run.folder} with {first.folder}: {what} is {other} here and "
-                    f"{there[what]} there; the same starts need the same tokens and {_DRAWN_BY}"
-                )
-        if run.task.layout.fingerprint() != first.task.layout.fingerprint():
-            raise RunError(
-                f"cannot compare {run.folder} with {first.folder}: their tokens have other "
-                "corners; the same starts need the same tokens and arena"
-            )
-
-
-def _drawn_by(task: Place) -> dict[str, str]:
-    """What decides which episodes are drawn."""
-    sim = {f"sim.{name}": told(getattr(task.sim, name)) for name in ("arena", *OF_STARTS)}
-    return {"tokens": _tokens(task), **sim}
-
-
-def _tokens(task: Place) -> str:
-    names = ", ".join(shape.name for shape in task.layout.shapes)
-    return f"[{names}] of scale {task.tokens.scale:.6g}"
-
-
-def distinct_names(folders: Sequence[Path]) -> list[str]:
-    """The folders' names, with as many parents before them as tell all of them apart."""
-    longest = max(len(folder.parts) for folder in folders)
-    for depth in range(1, longest + 1):
-        names = ["/".join(folder.parts[-depth:]) for folder in folders]
-        if len(set(names)) == len(names):
-            return names
-    return [str(folder) for folder in folders]
-
-
-def _films(config: PlayConfig, shown: Sequence[tuple[Place, Played]]) -> list[list[Image.Image]]:
-    """For each run its frames, equally many: only the last one for a PNG."""
-    if _is_still(config.out):
-        scenes = [[played.ends] for _, played in shown]
-    else:
-        scenes = equally_long(shown)
-    return [
-        [draw_sheet(task, played, corners, COMPARED // len(shown)) for corners in film]
-        for (task, played), film in zip(shown, scenes, strict=True)
-    ]
-
-
-def equally_long(shown: Sequence[tuple[Place, Played]]) -> list[list[Floats]]:
-    """For each run the corners (E, V, 2) of every frame; a shorter film keeps its last one."""
-    count = frames_per_action(max(played.episodes.actions.shape[1] for _, played in shown))
-    films = [motion(task.layout, played.corners, count) for task, played in shown]
-    longest = max(map(len, films))
-    return [film + [film[-1]] * (longest - len(film)) for film in films]
-
-
-def headed(panel: Image.Image, title: str, score: str) -> Image.Image:
-    """A run's picture below its name and its score; a long name loses its beginning."""
-    canvas = Image.new("RGB", (panel.width, panel.height + HEADER), PAPER)
-    canvas.paste(panel, (0, HEADER))
-    draw = ImageDraw.Draw(canvas)
-    font = ImageFont.load_default(TITLE)
-    left = panel.width // 30
-    short = title
-    while len(short) > 1 and draw.textlength(short, font) > panel.width - 2 * left:
-        short = "…" + short.lstrip("…")[1:]
-    draw.text((left, 6), short, TEXT, font)
-    draw.text((left, 6 + TITLE + 4), score, FAINT, ImageFont.load_default(SCORE))
-    return canvas
 
 
 def side_by_side(panels: Sequence[Image.Image]) -> Image.Image:

@@ -10,7 +10,6 @@ import numpy.typing as npt
 from tangram_core.arrays import Floats, Pixels
 from tangram_core.errors import ConfigError
 from tangram_sim.config import RewardConfig
-from tangram_sim.screen import Screen
 from tangram_sim.table import SQUARE_SCALE, Observation, Table
 
 
@@ -33,7 +32,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     could not be set down, and `reward_camera` (Eq. 14 from the pictures) with the camera on.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
 
     def __init__(
         self,
@@ -53,7 +52,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             scale: see `TokensConfig`; the default makes the square's side 0.4.
             reward: the name of a reward, or its whole configuration.
             success_overlap: raw overlap from which an episode counts as a success.
-            render_mode: None, human (a window, with pygame) or rgb_array.
+            render_mode: None or rgb_array.
             render_size: side of the rendered picture in pixels.
             horizon: steps that an episode has. An id has it, as its time limit does not change
                 with other settings: those that would make longer or shorter episodes are refused.
@@ -62,10 +61,8 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         Raises:
             ConfigError: a setting that cannot work.
         """
-        check_render_mode(render_mode, (None, "human", "rgb_array"))
+        check_render_mode(render_mode)
         self.render_mode = render_mode
-        human = render_mode == "human"
-        self._screen = Screen("Tangram", self.metadata["render_fps"]) if human else None
         self._table = Table(1, shapes, scale, reward, success_overlap, render_size, horizon, **sim)
         self.batch = self._table.batch
         self.layout, self.sim = self.batch.layout, self.batch.sim
@@ -78,7 +75,6 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         """Begin an episode; a seed fixes this one and all that follow; SamplingError: no room."""
         super().reset(seed=seed, options=options)
         self._table.reset([self.np_random])
-        self._show()
         return self._observation(), {}
 
     def step(
@@ -87,7 +83,6 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         """Play one action of shape (A,)."""
         result = self._table.step(np.asarray(action, dtype=np.float64)[None])
         terminated, truncated = self._table.ends(result)
-        self._show()
         return (
             self._observation(),
             float(result.rewards[0]),
@@ -115,25 +110,18 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         return float(rewards[0]) if achieved.ndim == 1 else rewards
 
     def render(self) -> Pixels | None:
-        """The scene as (size, size, 3), the token that moved last marked; None but in rgb_array."""
-        return self._table.picture(0) if self.render_mode == "rgb_array" else None
+        """The scene as (size, size, 3), the last mover marked; None without a render mode."""
+        return None if self.render_mode is None else self._table.picture(0)
 
     def close(self) -> None:
-        """Free the engine, and close the window."""
+        """Free the engine."""
         self.batch.close()
-        if self._screen is not None:
-            self._screen.close()
-
-    def _show(self) -> None:
-        if self._screen is not None:
-            self._screen.show(self._table.picture(0))
 
     def _observation(self) -> Observation:
         return {name: entry[0] for name, entry in self._table.observations().items()}
 
 
-def check_render_mode(given: str | None, modes: Sequence[str | None]) -> None:
-    """Raise ConfigError for a render mode that is none of these."""
-    if given not in modes:
-        *others, last = map(str, modes)
-        raise ConfigError(f"render_mode must be {', '.join(others)} or {last}, got '{given}'")
+def check_render_mode(given: str | None) -> None:
+    """Raise ConfigError for what is no render mode."""
+    if given not in (None, "rgb_array"):
+        raise ConfigError(f"render_mode must be None or rgb_array, got '{given}'")

@@ -50,7 +50,7 @@ class TangramVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
             ConfigError: a setting that cannot work.
         """
         self.closed = True  # older gymnasium closes even what was refused
-        check_render_mode(render_mode, (None, "rgb_array"))
+        check_render_mode(render_mode)
         modes = {AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP}
         if autoreset_mode not in modes | {mode.value for mode in modes}:
             raise ConfigError(f"autoreset_mode must be NextStep or SameStep, got {autoreset_mode}")
@@ -60,10 +60,7 @@ class TangramVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._mode = AutoresetMode(autoreset_mode)
-        self.metadata = TangramEnv.metadata | {
-            "render_modes": ["rgb_array"],
-            "autoreset_mode": self._mode,
-        }
+        self.metadata = TangramEnv.metadata | {"autoreset_mode": self._mode}
         self._table = Table(num_envs, **settings)
         self._limit = max_episode_steps
         self.batch = self._table.batch

@@ -18,7 +18,6 @@ from conf.commands import COMMANDS, GROUPS, OVER, Plain, laid_over
 from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of
 from conf.settings import PAGE, page
-from conf.sweep import check_launcher, refuse_lost_job
 from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.base.config import NetConfig
 from tangram_core.errors import ConfigError, TangramError
@@ -427,9 +426,6 @@ def test_entry_does_not_hide_a_fault_of_ours(entered: Entered) -> None:
         entered("eval run_dir=x", lambda settings: 1 // 0)
 
 
-SLURM = "hydra/launcher=submitit_slurm"
-
-
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -446,8 +442,6 @@ SLURM = "hydra/launcher=submitit_slurm"
         ("train sim=[physics,kinematic]", "sim takes one preset, got [physics,kinematic]"),
         ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
         ("eval run_dir=x -seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
-        (f"eval run_dir=x {SLURM}", "is for the jobs of a sweep: add --multirun"),
-        (f"eval run_dir=x -m {SLURM}", "needs the extra slurm: .ci/install .venv slurm in"),
     ],
 )
 def test_what_would_be_taken_for_something_else_is_refused(
@@ -457,27 +451,8 @@ def test_what_would_be_taken_for_something_else_is_refused(
     line: str,
     message: str,
 ) -> None:
-    monkeypatch.setattr("conf.sweep.find_spec", lambda name: None)
     assert entered(line) == (2, [])
     assert message in capsys.readouterr().err
-
-
-def test_slurm_is_asked_for_only_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("conf.sweep.find_spec", lambda name: name)
-    check_launcher(["-m", "hydra/launcher=basic"])
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    check_launcher(["-m", "hydra/launcher=submitit_local"])
-    with pytest.raises(ConfigError, match="needs SLURM, and there is no srun"):
-        check_launcher(["-m", "hydra/launcher=submitit_slurm"])
-    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/srun")
-    check_launcher(["-m", "hydra/launcher=submitit_slurm"])
-
-
-def test_a_lost_job_of_a_sweep_is_told_in_one_line() -> None:
-    lost = type("UncompletedJobError", (Exception,), {"__module__": "submitit.core.utils"})
-    with pytest.raises(TangramError, match="was lost .Job 3 has no output.; the same command"):
-        refuse_lost_job(lost("Job 3\nhas no output\n----\nmany lines"))
-    refuse_lost_job(ZeroDivisionError())
 
 
 # The page of all settings

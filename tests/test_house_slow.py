@@ -231,8 +231,8 @@ def test_install_takes_the_cpu_build_where_it_is_offered(tmp_path: Path, offered
 @pytest.mark.check
 def test_the_bill_of_materials_has_the_lock(tmp_path: Path) -> None:
     """Of an environment with all extras; make sbom also validates it, which takes long."""
-    for module in ("mkdocs", "submitit"):
-        pytest.importorskip(module, reason="pip install '.[docs,slurm]'")
+    for module in ("mkdocs", "av"):
+        pytest.importorskip(module, reason="pip install '.[docs,video]'")
     recipe = run(["make", "--dry-run", "sbom"]).stdout.splitlines()
     command = next(line for line in recipe if "cyclonedx-py" in line)
     assert "--no-validate" not in command

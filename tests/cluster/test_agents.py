@@ -4,23 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from tangram_agent.pretrained import agent_names
 from tests.cluster.processes import run_here
-from tests.worker.builders import write_run
 
 pytestmark = pytest.mark.cluster
-
-
-def test_runs_are_compared_from_the_folder_that_they_lie_in(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        write_run(tmp_path / "runs" / name)
-    arguments = ("compare=[runs/one,runs/two]", "out=both.png", "episodes=2")
-    printed = run_here("tangram-play", *arguments, cwd=tmp_path)
-    assert "one: mean raw overlap" in printed
-    with Image.open(tmp_path / "both.png") as picture:
-        assert picture.format == "PNG"
 
 
 @pytest.mark.parametrize("name", agent_names())

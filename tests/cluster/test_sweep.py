@@ -1,4 +1,4 @@
-"""Sweeps whose jobs are processes elsewhere: what they leave, what is heard of those that fail."""
+"""Sweeps: what they read, and what is heard of a job that fails."""
 
 import json
 from pathlib import Path
@@ -8,26 +8,13 @@ import pytest
 from tests.cluster.processes import BIN, ended, run
 
 pytestmark = pytest.mark.cluster
-pytest.importorskip("submitit", reason="needs the extra: pip install -e '.[slurm]'")
-
-SWEEP = ("--multirun", "hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5")
-TINY = ("sim=kinematic", "max_updates=2", "service.eval_episodes=4", "agent.learning_starts=32")
 
 
-@pytest.mark.check
-def test_each_job_of_a_sweep_leaves_a_run_of_its_own(tmp_path: Path) -> None:
-    seeds = ("seed=3,4", "run_dir=sweep", "agent.batch_size=8")
-    run("tangram-train", *SWEEP, *seeds, *TINY, cwd=tmp_path)
-    results = [json.loads((tmp_path / f"sweep/{n}/result.json").read_text()) for n in (0, 1)]
-    assert [(one["seed"], one["updates"]) for one in results] == [(3, 2), (4, 2)]
-
-
-def test_a_job_that_is_refused_is_heard_of_at_home(tmp_path: Path) -> None:
-    overrides = ("seed=3,4", "run_dir=sweep", "agent.batch_size=0")
-    done = ended(BIN / "tangram-train", *SWEEP, *overrides, cwd=tmp_path)
-    job, said = done.stderr.splitlines()  # hydra says which job it was
-    assert (done.returncode, "seed=3" in job) == (2, True)
-    assert said == "tangram-train: agent.batch_size must be at least 1, got 0"
+def test_a_job_that_is_refused_is_heard_of(tmp_path: Path) -> None:
+    overrides = ("--multirun", "seed=3,4", "run_dir=sweep", "agent.batch_size=0")
+    done = ended(BIN / "tangram-train", *overrides, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "tangram-train: agent.batch_size must be at least 1, got 0\n" in done.stderr
 
 
 def test_a_sweep_reads_the_run_that_it_is_told(tmp_path: Path) -> None:

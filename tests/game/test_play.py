@@ -1,4 +1,4 @@
-"""tangram-play: which episodes are shown, what is drawn of them, and runs side by side."""
+"""tangram-play: which episodes are shown, and what is drawn of them."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -14,13 +14,9 @@ from tangram_agent.agents.outline.filler import Filler
 from tangram_agent.base.types import Choice
 from tangram_agent.runs import load_changed, load_run
 from tangram_core.arrays import Floats
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError
 from tangram_game.config import PlayConfig
 from tangram_game.play import (
-    compare_runs,
-    distinct_names,
-    equally_long,
-    headed,
     make_show,
     motion,
     play_episodes,
@@ -29,8 +25,6 @@ from tangram_game.play import (
 from tangram_game.show.film import Show, film_pictures
 from tangram_game.show.views import beside, camera_sheets
 from tangram_sim.geometry.overlap import outlines, pairs_overlap
-from tangram_tasks.place import Place
-from tangram_tasks.played import Played
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 from tests.worker.builders import write_run
@@ -60,7 +54,7 @@ def of_game(folder: Path, **settings: Any) -> PlayConfig:
 
 
 def shown(config: PlayConfig) -> Show:
-    return make_show(load_run(config.run_dirs[0]), config)
+    return make_show(load_run(config.run), config)
 
 
 # What the camera sees beside it
@@ -255,105 +249,3 @@ def test_a_film_has_a_picture_for_each_frame(
     pictures = film_pictures(show)
     assert len(pictures) == 1 + 14 + 1
     assert all((np.asarray(a) != np.asarray(b)).any() for a, b in pairwise(pictures))
-
-
-# Runs side by side
-
-
-def compared(folder: Path, *names: str, **more: Any) -> PlayConfig:
-    runs = tuple(str(folder / name) for name in names)
-    return PlayConfig(compare=runs, **({"out": str(folder / "both.gif"), "episodes": 2} | more))
-
-
-def played_by_two(folder: Path, episodes: int, **second: Any) -> list[tuple[Place, Played]]:
-    """Tasks and episodes of two runs of the square, the second with other sections."""
-    write_run(folder / "first")
-    write_run(folder / "second", **second)
-    config = compared(folder, "first", "second", episodes=episodes)
-    runs = [load_run(run) for run in config.run_dirs]
-    return [(run.task, play_episodes(run, config)) for run in runs]
-
-
-def test_all_have_the_same_starts_and_targets(tmp_path: Path) -> None:
-    (_, one), (_, other) = played_by_two(tmp_path, 3, agent=PLAIN_AGENT, sim={"backend": "physics"})
-    np.testing.assert_allclose(one.starts, other.starts, atol=1e-6)
-    np.testing.assert_array_equal(one.goals, other.goals)
-    assert (one.ends != other.ends).any()
-
-
-def test_a_shorter_episode_waits_for_the_longer_one(tmp_path: Path) -> None:
-    plays = played_by_two(tmp_path, 1, sim={"backend": "kinematic", "actions_per_token": 3})
-    films = equally_long(plays)
-    assert len(films[0]) == len(films[1]) == 1 + 3 * 6
-    np.testing.assert_array_equal(films[0][-1], films[0][6])
-
-
-def own(side: float) -> dict[str, Any]:
-    corners = [[0.0, 0.0], [side, 0.0], [0.0, 0.3]]
-    return {"tokens": {"shapes": [{"name": "own", "corners": corners}], "scale": 1.0}}
-
-
-@pytest.mark.parametrize(
-    ("first", "other", "reason"),
-    [
-        ({}, {"tokens": {"shapes": ["small_triangle"], "scale": 1.6}}, r"is \[small_triangle\]"),
-        ({}, {"tokens": PAIR}, r"tokens is \[square, large_triangle\]"),
-        ({}, {"tokens": SQUARE | {"scale": 0.5}}, "of scale 0.5 here"),
-        ({}, {"sim": {"backend": "kinematic", "arena": 3.0}}, "sim.arena is 3 here and 2 there"),
-        (
-            {},
-            {"sim": {"backend": "kinematic", "targets": "connected"}},
-            "sim.targets is connected here and uniform there; the same starts need",
-        ),
-        (own(0.3), own(0.4), "their tokens have other corners"),
-    ],
-)
-def test_runs_of_another_task_are_refused(
-    tmp_path: Path, first: dict, other: dict, reason: str
-) -> None:
-    write_run(tmp_path / "first", **first)
-    write_run(tmp_path / "second", **other)
-    with pytest.raises(RunError, match=reason) as caught:
-        compare_runs(compared(tmp_path, "first", "second"))
-    assert str(tmp_path / "second") in str(caught.value)
-    assert not (tmp_path / "both.gif").exists()
-
-
-@pytest.mark.parametrize(
-    ("folders", "names"),
-    [
-        (["runs/a", "runs/b"], ["a", "b"]),
-        (["paper/seed_0", "mlp/seed_0"], ["paper/seed_0", "mlp/seed_0"]),
-        (["x/a/s", "x/b/s", "y/b/s"], ["x/a/s", "x/b/s", "y/b/s"]),
-        (["square", "pretrained/square"], ["square", "pretrained/square"]),
-    ],
-)
-def test_labels_tell_the_runs_apart(folders: list[str], names: list[str]) -> None:
-    assert distinct_names([Path(folder) for folder in folders]) == names
-
-
-def test_a_long_name_stays_inside_its_column() -> None:
-    panel = Image.new("RGB", (200, 50), "white")
-    picture = np.asarray(headed(panel, "a_long_name/" * 20, "score").convert("L"))
-    assert (picture[:, -4:] > 200).all()
-
-
-def test_two_agents_move_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_run(tmp_path / "first")
-    write_run(tmp_path / "second", agent=PLAIN_AGENT)
-    assert compare_runs(compared(tmp_path, "first", "second", episodes=1)) == 0
-    printed = capsys.readouterr().out
-    assert f"{tmp_path / 'both.gif'}: 1 episode; first: mean raw overlap 0." in printed
-    assert "; second: mean raw overlap 0." in printed
-    with Image.open(tmp_path / "both.gif") as film:
-        assert film.n_frames > 5
-        assert film.width > film.height
-        begin = halves(film)
-        film.seek(film.n_frames - 1)
-        assert all((a != b).any() for a, b in zip(begin, halves(film), strict=True))
-
-
-def halves(film: Image.Image) -> tuple[np.ndarray, np.ndarray]:
-    pixels = np.asarray(film.convert("RGB"))
-    middle = pixels.shape[1] // 2
-    return pixels[:, : middle - 12], pixels[:, middle + 12 :]

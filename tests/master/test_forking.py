@@ -11,7 +11,8 @@ import psutil
 import pytest
 
 from master.children import Child
-from master.forking import HELD_BACK, warm_up
+from master.forking import warm_up
+from master.signals import SIGNALS
 from tangram_core.errors import TangramError
 from tests.bodies import run_code
 
@@ -42,9 +43,9 @@ def test_signals_to_a_whole_job_end_its_children_and_leave_the_server() -> None:
     ended: SimpleQueue[Child] = SimpleQueue()
     first = waiting(ended)
     before = server()
-    for number in HELD_BACK:
+    for number in SIGNALS:
         before.send_signal(number)
-    for number in HELD_BACK:
+    for number in SIGNALS:
         if signal.getsignal(number) == signal.SIG_IGN:  # as nohup does, and children inherit it
             continue
         one = waiting(ended)

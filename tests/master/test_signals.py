@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from master.signals import SIGNALS, SUBMITIT, StopSignals
+from master.signals import SIGNALS, StopSignals
 from tangram_core.run.process import handling
 
 LIMIT_S = 100.0
@@ -23,7 +23,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 SIGNALLED = """
 import signal, sys
 from master.signals import StopSignals
-for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
     signal.signal(number, signal.SIG_DFL)
 with StopSignals() as stop:
     print("ready", flush=True)
@@ -57,7 +57,7 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
 @pytest.mark.cluster
 @pytest.mark.parametrize(
     ("number", "kind"),
-    [(signal.SIGTERM, "orderly"), *((number, "stuck") for number in (*ENDING, SUBMITIT))],
+    [(signal.SIGTERM, "orderly"), *((number, "stuck") for number in ENDING)],
 )
 def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind: str) -> None:
     command = [sys.executable, "-c", SIGNALLED, kind]

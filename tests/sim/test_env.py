@@ -42,13 +42,6 @@ PLAYED = [
 ]
 
 
-@pytest.fixture
-def fast_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A display without a screen, and no waiting between pictures."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    monkeypatch.setitem(TangramEnv.metadata, "render_fps", 1000)
-
-
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
@@ -58,7 +51,7 @@ def fast_window(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_gymnasium_checks_it_without_a_warning(
-    name: str, settings: dict[str, Any], made: list[Any], fast_window: None
+    name: str, settings: dict[str, Any], made: list[Any]
 ) -> None:
     if settings.get("motion") == "slide":
         settings = settings | {"backend": "physics"}  # nothing else has contacts
@@ -224,45 +217,12 @@ def test_render() -> None:
     assert kinematic().render() is None
 
 
-def test_human_shows_each_step_in_a_window(fast_window: None) -> None:
-    pygame = pytest.importorskip("pygame", reason="pip install '.[human]'")
-    envs = [kinematic(render_mode=mode, render_size=90) for mode in ("human", "rgb_array")]
-    for play in (
-        lambda env: env.reset(seed=0),
-        lambda env: env.step(np.array([0.3, 0.2, 0.1], dtype=np.float32)),
-    ):
-        for env in envs:
-            play(env)
-        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-        np.testing.assert_array_equal(shown, envs[1].render())
-    assert envs[0].render() is None
-    for _ in range(2):
-        envs[0].close()
-    assert not pygame.display.get_init()
-
-
-def test_without_pygame_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ConfigError, match="needs pygame, .*: pip install 'tangram-rl.human.', or"):
-        kinematic(render_mode="human")
-
-
-@pytest.mark.parametrize("driver", ["", "odd"])
-def test_a_window_needs_a_display(driver: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("pygame", reason="pip install '.[human]'")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("SDL_VIDEODRIVER", driver)
-    with pytest.raises(ConfigError, match="render_mode=human needs a display .*: log in with one"):
-        kinematic(render_mode="human")
-
-
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
         ({"shapes": ("hexagon",)}, "unknown shape 'hexagon'"),
         ({"reward": "luck"}, "reward.name must be one of"),
-        ({"render_mode": "3d"}, "render_mode must be None, human or rgb_array, got '3d'"),
+        ({"render_mode": "3d"}, "render_mode must be None or rgb_array, got '3d'"),
         ({"horizon": 2}, "has 1 steps, and the id's time limit is 2: give horizon=1 and max_ep"),
         ({"gravity": 9.81}, "unknown setting 'gravity' of the environment: .* backend, arena"),
         ({"success_overlap": 7}, "success_overlap must be between 0 and 1, got 7"),

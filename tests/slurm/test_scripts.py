@@ -2,12 +2,12 @@
 
 import re
 from collections.abc import Iterator
-from itertools import count
 from pathlib import Path
 
 import pytest
 
 from conf.cli import composed
+from conf.own import with_named_code
 
 pytestmark = pytest.mark.fast
 
@@ -29,20 +29,18 @@ def identity(path: Path) -> str:
     return path.relative_to(FOLDER).as_posix()
 
 
-def settings(path: Path) -> Iterator[tuple[str, str]]:
-    """Every setting that a script or an example in it gives: the command's config, and the word."""
+def settings(path: Path) -> Iterator[list[tuple[str, str]]]:
+    """What each line of a script or of an example in it sets: a command's config, and the word."""
     text = path.read_text().replace("\\\n", " ")
     for line in text.splitlines():
         taker = TAKERS.search(line)
         if taker is None:
             continue
+        found = []
         for name, value in SETTING.findall(line[taker.end() :]):
-            if name.startswith("hydra."):
-                continue
-            primary = "worker" if name in OF_WORKERS else "master"
             known = PATHS.get(name, "1") if "$" in value else value
-            for one in known.split(","):
-                yield primary, f"{name}={one}"
+            found.append(("worker" if name in OF_WORKERS else "master", f"{name}={known}"))
+        yield found
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=identity)
@@ -50,23 +48,21 @@ def test_scripts_stop_at_the_first_error_and_every_setting_is_one_of_the_config(
     text = path.read_text()
     sourced = text.startswith("# ")  # the script that sources it says so
     assert sourced or "\nset -euo pipefail\n" in text
-    rounds: dict[tuple[str, int], dict[str, str]] = {}  # each with a name but once
-    for primary, override in dict.fromkeys(settings(path)):
-        name = override.partition("=")[0]
-        number = next(n for n in count() if name not in rounds.get((primary, n), {}))
-        rounds.setdefault((primary, number), {})[name] = override
-    for (primary, _), given in rounds.items():
-        connect = {"connect": "connect=runs/x"} if primary == "worker" else {}
-        composed(primary, [*(connect | given).values()])
+    for line in settings(path):
+        for primary in dict(line):
+            given = [word for one, word in line if one == primary]
+            if primary == "worker" and not any(word.startswith("connect=") for word in given):
+                given.append("connect=runs/x")
+            composed(primary, with_named_code(given))
 
 
 def test_settings_are_found() -> None:
-    found = {path.name: [word for _, word in settings(path)] for path in SCRIPTS}
+    found = {path.name: [word for line in settings(path) for _, word in line] for path in SCRIPTS}
     assert {"run_dir=runs/x", "resume=auto", "service.threads=1"} == set(found["master.sh"])
     assert {"seed=1", "tokens=parallelogram", "role=evaluator", "service.bind=0.0.0.0"} <= set(
         found["train.sbatch"]
     )
-    assert {"max_updates=0", "agent=quick", "sim=kinematic"} <= set(found["tryparts.sh"])
+    assert {"max_updates=0", "task=gym", "sim=kinematic"} <= set(found["tryparts.sh"])
 
 
 @pytest.mark.parametrize("path", JOBS, ids=identity)

@@ -9,7 +9,6 @@ from tangram_game.cli import with_absolute_paths, with_changes
 from tangram_game.config import (
     EvalConfig,
     PlayConfig,
-    check_compare,
     check_puzzle,
     source_and_names,
 )
@@ -19,7 +18,6 @@ pytestmark = pytest.mark.fast
 
 RUN = {"run_dir": "runs/one"}
 TESTED = RUN | {"puzzle": ("test",)}
-TWO = {"compare": ("a", "b")}
 OF_A_RUN = [
     ({"run_dir": ""}, "set run_dir=runs/my_run"),
     ({"episodes": 0}, "episodes must be between 1 and"),
@@ -59,8 +57,7 @@ WRONG = {
             ({"out": out}, "out must end with .gif, .mp4, .png, got")
             for out in ("film.webm", "film", "", "gif", "film.GIF.txt")
         ],
-        ({"run_dir": None}, "say which run: run_dir=runs/..., or which ones: compare=[runs/a,"),
-        ({"run_dir": "a"} | TWO, "run_dir=a changes nothing with compare=[a,b]: leave it out, or"),
+        ({"run_dir": None}, "say which run: run_dir=runs/..."),
         ({"turns": 2}, "turns=2 changes nothing with puzzle=null"),
         ({"puzzle": ("cat",), "episodes": 5}, "episodes=5 changes nothing with puzzle=[cat]"),
         *[
@@ -71,12 +68,6 @@ WRONG = {
             for name in ("targets", "mirrored", "starts")
         ],
         ({"run_dir": " "}, "run_dir must name"),
-        *[
-            ({"run_dir": None, "compare": runs}, "compare must list 2 to 4")
-            for runs in ((), ("a",), ("a", "b", "c", "d", "e"), ("a", ""))
-        ],
-        ({"run_dir": None, "compare": ("a", "a")}, "different runs"),
-        ({"run_dir": None} | TWO | {"puzzle": ("cat",)}, "puzzle=[cat] changes nothing with comp"),
     ],
 }
 CASES = [(kind, *case) for kind, cases in WRONG.items() for case in cases]
@@ -89,12 +80,6 @@ def test_wrong_settings_are_refused_with_what_to_do(kind: type, wrong: dict, rea
     with pytest.raises(ConfigError) as caught:
         kind(**(right | wrong))
     assert reason in str(caught.value)
-
-
-@pytest.mark.parametrize("value", ["a,b", {"a": 1}, 3, [1, 2]])
-def test_what_is_no_list_of_folders_is_refused(value: object) -> None:
-    with pytest.raises(ConfigError, match="set compare=\\[runs/a,runs/b\\]"):
-        check_compare(value)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +120,7 @@ def test_what_names_no_puzzle_is_refused(value: object) -> None:
 )
 def test_which_run_is_played(monkeypatch: pytest.MonkeyPatch, settings: dict, run_dir: str) -> None:
     monkeypatch.setattr("tangram_game.config.agent_names", lambda: ["tangram7"])
-    assert PlayConfig(**settings).run_dirs == (run_dir,)
+    assert PlayConfig(**settings).run == run_dir
 
 
 def test_puzzles_are_for_the_agent_of_the_game_if_there_is_one(
@@ -159,15 +144,12 @@ def test_paths_are_seen_from_the_callers_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pretrained" / "mine").mkdir(parents=True)
-    mine = f"{tmp_path}/pretrained/mine"
     for name, given, seen in (
         ("run_dir", None, None),
         ("run_dir", "pretrained/x", "pretrained/x"),
-        (
-            "compare",
-            ["runs/a", "/b", "pretrained/square", "pretrained/mine"],
-            [f"{tmp_path}/runs/a", "/b", "pretrained/square", mine],
-        ),
+        ("run_dir", "runs/a", f"{tmp_path}/runs/a"),
+        ("run_dir", "/b", "/b"),
+        ("run_dir", "pretrained/mine", f"{tmp_path}/pretrained/mine"),
         ("out", "pretrained/x.png", f"{tmp_path}/pretrained/x.png"),
         ("sheet", "a.png", f"{tmp_path}/a.png"),
         ("puzzle", "mine.json", (f"{tmp_path}/mine.json",)),

@@ -26,7 +26,7 @@ from tangram_core.wire.messages import TAKEN_OVER
 from worker.config import WorkerConfig
 from worker.talk.client import Client
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2)
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 REPORT_S = 30.0
 
 _log = logging.getLogger(__name__)
