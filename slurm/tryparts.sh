@@ -204,7 +204,7 @@ try_tasks() {
         jobs+=("$(submit "$out/$seed" --ntasks=3 slurm/train.sbatch seed="$seed" sim=kinematic "${short[@]}")")
     done
     jobs+=("$(submit "$gym" --ntasks=3 slurm/train.sbatch task=gym task.id=FetchPush-v4 \
-        task.imports=[gymnasium_robotics] max_updates=40 "${TINY[@]}")")
+        'task.imports=[gymnasium_robotics]' max_updates=40 "${TINY[@]}")")
     jobs+=("$(submit "$own" --ntasks=3 slurm/train.sbatch task=docs/examples/point.py:Point \
         agent=docs/examples/td3.py:TD3 max_updates=40 "${TINY[@]}")")
     await_end "${jobs[@]}"
