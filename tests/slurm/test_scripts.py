@@ -38,7 +38,7 @@ def settings(path: Path) -> Iterator[list[tuple[str, str]]]:
             continue
         found = []
         for name, value in SETTING.findall(line[taker.end() :]):
-            known = PATHS.get(name, "1") if "$" in value else value
+            known = PATHS.get(name, "1") if "$" in value else value.rstrip("'")
             found.append(("worker" if name in OF_WORKERS else "master", f"{name}={known}"))
         yield found
 
