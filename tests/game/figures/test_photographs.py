@@ -202,7 +202,7 @@ def test_a_photograph_is_instead_of_other_targets() -> None:
         PlayConfig("pretrained/square", target="it.png", puzzle=("cat",))
     with pytest.raises(ConfigError, match="^sim.targets=uniform changes nothing with target: "):
         PlayConfig(target="it.png", changes={"sim": {"targets": "uniform"}})
-    assert PlayConfig(target="it.png").run_dirs == ("pretrained/tangram7",)
+    assert PlayConfig(target="it.png").run == "pretrained/tangram7"
 
 
 def test_a_photograph_is_not_written_over(tmp_path: Path) -> None:
