@@ -24,7 +24,7 @@ from conf.arguments import (
 )
 from conf.commands import COMMANDS, GROUPS, Plain
 from conf.help import choices, group_help, help_text, setting_names
-from conf.kinds import Kinds, kinds_of
+from conf.kinds import Kinds, kinds_of, with_usual_agent
 from conf.own import with_named_code, without_named_code
 from tangram_core.errors import ConfigError, TangramError
 from tangram_core.registry import TASK
@@ -66,6 +66,8 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
     try:
         folder, arguments = without_own_presets(arguments)
         arguments = with_named_code(arguments)
+        if config_name in MAKE_RUNS:
+            arguments = with_usual_agent(arguments, folder)
         if {"-h", "--help"} & set(arguments):
             kinds = kinds_of(arguments, folder)
             sections = COMMANDS[config_name].sections(kinds)

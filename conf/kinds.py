@@ -63,6 +63,15 @@ def kinds_of(
     return Kinds(found[TASK] or usual.task, found[AGENT] or usual.agent)
 
 
+def with_usual_agent(arguments: Sequence[str], folder: str | None = None) -> list[str]:
+    """The arguments of a new run; where they name a task and no agent, the one that it names."""
+    given = {argument.lstrip("+").partition("=")[0] for argument in arguments}
+    task = _chosen(TASK, arguments, folder, None)
+    if task in (None, Kinds().task) or given & {AGENT, f"{AGENT}.{KIND}", "from_config"}:
+        return [*arguments]
+    return [*arguments, f"{AGENT}={find_task(task).agent}"]
+
+
 def _chosen(
     role: str, arguments: Sequence[str], folder: str | None, stored: dict[str, Any] | None
 ) -> str | None:

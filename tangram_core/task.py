@@ -145,6 +145,7 @@ class Task(ABC):
     """
 
     sections: ClassVar[Mapping[str, type[Settings]]] = {}
+    agent: ClassVar[str] = "goal"  # who learns it, where a command line names nobody: a preset
     waits: ClassVar[str] = "none so far can be"  # what helps, where no episode can be learned from
     scores: ClassVar[tuple[Score, ...]] = ()
 

@@ -26,6 +26,7 @@ _AREAS = (
 class Fill(Place):
     """A token goes where it is taken, once, from outside of the outline."""
 
+    agent: ClassVar[str] = "outline"
     outlines: ClassVar[bool] = True
 
     @property

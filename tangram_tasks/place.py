@@ -61,6 +61,7 @@ class Place(Task):
     """The paper's task, and all of the tangram: every piece of the target is seen."""
 
     sections: ClassVar = {"tokens": TokensConfig, "sim": SimConfig, "reward": RewardConfig}
+    agent: ClassVar = "tangram"
     waits: ClassVar = "in one, pictures must show all tokens: larger sim.pixels help"
     outlines: ClassVar[bool] = False  # whether goals are rows of the target's outline
 

@@ -13,7 +13,7 @@ import pytest
 
 from conf.commands import COMMANDS
 from conf.help import choices, setting_names
-from conf.kinds import every_kind, kinds_of
+from conf.kinds import every_kind, kinds_of, with_usual_agent
 from conf.own import with_named_code, without_named_code
 from tangram_lab.benchmarks.cli import _parser as bench_parser
 from tests.blocks import PAGES
@@ -81,7 +81,7 @@ def unknown(words: list[str]) -> list[str]:
     name = PRIMARIES[words[0]]
     groups = COMMANDS[name].groups
     with chdir(ROOT):  # where a page's commands find the examples
-        words = with_named_code(words)
+        words = with_usual_agent(with_named_code(words))
     settings = set(setting_names(name, kinds_of(words)))
     words = words if "task" in groups else without_named_code(words)
     refused = []

@@ -1,6 +1,6 @@
 """A task of one's own: a point on a square must come to a place.
 
-Train it with: tangram-train task=docs/examples/point.py:Point agent=goal
+Train it with: tangram-train task=docs/examples/point.py:Point
 """
 
 from dataclasses import dataclass

@@ -1,5 +1,6 @@
 """How the processes of a run work together."""
 
+import os
 from dataclasses import dataclass
 
 from tangram_core.run.process import FORMATS
@@ -7,6 +8,7 @@ from tangram_core.settings import Settings, setting
 from tangram_core.wire.addresses import LOCAL, check_host
 
 MOST_ENVS, STEPS = 16, 128  # of service.envs=0: environments, and steps in all their episodes
+MOST_THREADS = 4  # of service.threads=0
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
 
@@ -78,7 +80,12 @@ class ServiceConfig(Settings, section="service"):
         30.0, "after which the master forgets a worker that says nothing", low=3, unit="s"
     )
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
-    threads: int = setting(1, "torch threads of the master", low=1, high=1024)
+    threads: int = setting(
+        0,
+        "torch threads of the master; 0: one, and idle cores of its machine, up to 4",
+        low=0,
+        high=1024,
+    )
     compile: bool = setting(
         False,
         "whether an update is compiled as a whole: up to a minute at first and seconds later, then "
@@ -89,6 +96,18 @@ class ServiceConfig(Settings, section="service"):
     def envs_for(self, horizon: int) -> int:
         """Environments in which one worker plays episodes of so many steps."""
         return self.envs or min(MOST_ENVS, max(1, STEPS // horizon))
+
+    def threads_beside(self, processes: int) -> int:
+        """Torch threads of a master beside so many processes that keep a core each.
+
+        With two a compiled update is 1.5 to 1.8 times as fast. Where another process needs the
+        core, they wait for each other, so nothing is taken that was busy a minute ago. In lockstep
+        it is always one: more add numbers in another order.
+        """
+        if self.threads or self.mode == "lockstep":
+            return max(1, self.threads)
+        idle = len(os.sched_getaffinity(0)) - processes - round(os.getloadavg()[0])
+        return min(MOST_THREADS, max(1, idle))
 
     def batch_episodes(self, horizon: int) -> int:
         """Episodes of so many steps in one message, where they are not too large for it."""

@@ -123,7 +123,7 @@ WRONG = [
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-master tokens.scale=1000", "does not fit into an arena of width 2"),
     (
-        "tangram-train task=gym task.id=Wears-v0 task.imports=[tests.core.toy] agent=goal "
+        "tangram-train task=gym task.id=Wears-v0 task.imports=[tests.core.toy] "
         "service.mode=lockstep",
         "plays an episode otherwise after another one: set task.fresh=true",
     ),
