@@ -82,7 +82,7 @@ class ServiceConfig(Settings, section="service"):
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
     threads: int = setting(
         0,
-        "torch threads of the master; 0: one, and idle cores of its machine, up to 4",
+        "torch threads of the master; 0: one, and with service.compile idle cores, up to 4",
         low=0,
         high=1024,
     )
@@ -100,11 +100,12 @@ class ServiceConfig(Settings, section="service"):
     def threads_beside(self, processes: int) -> int:
         """Torch threads of a master beside so many processes that keep a core each.
 
-        With two a compiled update is 1.5 to 1.8 times as fast. Where another process needs the
-        core, they wait for each other, so nothing is taken that was busy a minute ago. In lockstep
-        it is always one: more add numbers in another order.
+        With two a compiled update is 1.5 to 1.8 times as fast; single operations of a small network
+        gain nothing. Where another process needs the core, threads wait for each other, so nothing
+        is taken that was busy a minute ago. In lockstep it is always one: more add numbers in
+        another order.
         """
-        if self.threads or self.mode == "lockstep":
+        if self.threads or self.mode == "lockstep" or not self.compile:
             return max(1, self.threads)
         idle = len(os.sched_getaffinity(0)) - processes - round(os.getloadavg()[0])
         return min(MOST_THREADS, max(1, idle))

@@ -174,14 +174,18 @@ def test_wrong_service_settings_are_refused(name: str, value: object, reason: st
         from_mapping(ServiceConfig, {"bind": "::1", name: value})
 
 
+COMPILED = {"compile": True}
+
+
 @pytest.mark.parametrize(
     ("settings", "cores", "load", "beside", "threads"),
     [
-        ({}, 2, 0.2, 2, 1),
-        ({}, 4, 0.2, 2, 2),
-        ({}, 16, 0.2, 2, 4),
-        ({}, 16, 13.0, 2, 1),
-        ({"mode": "lockstep"}, 16, 0.2, 2, 1),
+        (COMPILED, 2, 0.2, 2, 1),
+        (COMPILED, 4, 0.2, 2, 2),
+        (COMPILED, 16, 0.2, 2, 4),
+        (COMPILED, 16, 13.0, 2, 1),
+        (COMPILED | {"mode": "lockstep"}, 16, 0.2, 2, 1),
+        ({}, 16, 0.2, 2, 1),
         ({"threads": 7}, 2, 0.2, 2, 7),
     ],
 )
