@@ -239,10 +239,7 @@ def _make_trainer(
 ) -> tuple[Trainer, Restored | None]:
     """What learns, with the newest checkpoint, or the networks of another run, where asked for."""
     service = config.service
-    threads = service.threads_beside(config.workers + 1)
-    torch.set_num_threads(threads)
-    if threads > 1:
-        log.info("learns with %d threads", threads)
+    torch.set_num_threads(service.threads)
     keep_memory()
     device = choose_device(service.device)
     trainer = Trainer(setup, config.seed, device, compiled=service.compile)

@@ -1,6 +1,5 @@
 """How the processes of a run work together."""
 
-import os
 from dataclasses import dataclass
 
 from tangram_core.run.process import FORMATS
@@ -8,7 +7,6 @@ from tangram_core.settings import Settings, setting
 from tangram_core.wire.addresses import LOCAL, check_host
 
 MOST_ENVS, STEPS = 16, 128  # of service.envs=0: environments, and steps in all their episodes
-MOST_THREADS = 4  # of service.threads=0
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
 
@@ -81,9 +79,10 @@ class ServiceConfig(Settings, section="service"):
     )
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
     threads: int = setting(
-        0,
-        "torch threads of the master; 0: one, and with service.compile idle cores, up to 4",
-        low=0,
+        1,
+        "torch threads of the master; more only on cores that nobody else uses: with service.compile "
+        "two are 1.5 to 1.8 times as fast, and far slower than one where another process is on theirs",
+        low=1,
         high=1024,
     )
     compile: bool = setting(
@@ -96,19 +95,6 @@ class ServiceConfig(Settings, section="service"):
     def envs_for(self, horizon: int) -> int:
         """Environments in which one worker plays episodes of so many steps."""
         return self.envs or min(MOST_ENVS, max(1, STEPS // horizon))
-
-    def threads_beside(self, processes: int) -> int:
-        """Torch threads of a master beside so many processes that keep a core each.
-
-        With two a compiled update is 1.5 to 1.8 times as fast; single operations of a small network
-        gain nothing. Where another process needs the core, threads wait for each other, so nothing
-        is taken that was busy a minute ago. In lockstep it is always one: more add numbers in
-        another order.
-        """
-        if self.threads or self.mode == "lockstep" or not self.compile:
-            return max(1, self.threads)
-        idle = len(os.sched_getaffinity(0)) - processes - round(os.getloadavg()[0])
-        return min(MOST_THREADS, max(1, idle))
 
     def batch_episodes(self, horizon: int) -> int:
         """Episodes of so many steps in one message, where they are not too large for it."""

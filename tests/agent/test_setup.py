@@ -166,35 +166,12 @@ def test_a_worker_plays_fewer_environments_the_longer_episodes_are(
         ("http_bind", "", "service.http_bind must be an address or a name of a machine"),
         ("host", "tcp://h", "service.host must be an address or a name of a machine"),
         ("device", "tpu", "service.device must be one of auto, cpu, cuda, got 'tpu'"),
-        ("threads", -1, "service.threads must be between 0"),
+        ("threads", 0, "service.threads must be between 1"),
     ],
 )
 def test_wrong_service_settings_are_refused(name: str, value: object, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         from_mapping(ServiceConfig, {"bind": "::1", name: value})
-
-
-COMPILED = {"compile": True}
-
-
-@pytest.mark.parametrize(
-    ("settings", "cores", "load", "beside", "threads"),
-    [
-        (COMPILED, 2, 0.2, 2, 1),
-        (COMPILED, 4, 0.2, 2, 2),
-        (COMPILED, 16, 0.2, 2, 4),
-        (COMPILED, 16, 13.0, 2, 1),
-        (COMPILED | {"mode": "lockstep"}, 16, 0.2, 2, 1),
-        ({}, 16, 0.2, 2, 1),
-        ({"threads": 7}, 2, 0.2, 2, 7),
-    ],
-)
-def test_a_master_takes_idle_cores(
-    settings: dict, cores: int, load: float, beside: int, threads: int, monkeypatch: Any
-) -> None:
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(cores))
-    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
-    assert from_mapping(ServiceConfig, settings).threads_beside(beside) == threads
 
 
 SEVERAL = {"shapes": ["square", "square"]}
