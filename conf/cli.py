@@ -254,6 +254,8 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    if config_name in MAKE_RUNS:
+        overrides = with_usual_agent(overrides)
     _register(config_name, kinds_of(overrides))
     alone = not GlobalHydra().is_initialized()
     try:

@@ -211,13 +211,9 @@ def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
     write_whole(Path(out), picture.getvalue())
 
 
-def draw_sheet(task: Place, played: Played, corners: Floats, width: int = SHEET) -> Image.Image:
-    """One tile for each of E episodes while its tokens are at corners (E, V, 2).
-
-    Args:
-        width: of all tiles of a row together, about, in pixels.
-    """
-    columns, size = _tiles(len(corners), width)
+def draw_sheet(task: Place, played: Played, corners: Floats) -> Image.Image:
+    """One tile for each of E episodes while its tokens are at corners (E, V, 2)."""
+    columns, size = _tiles(len(corners), SHEET)
     scenes = (played.starts, corners, played.goals)
     return episode_sheet(task.layout, task.sim.arena, *scenes, columns, size)
 

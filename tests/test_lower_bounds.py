@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.check, pytest.mark.timeout(3600)]
 
 # As in .ci/lock.py: nothing is built to be looked at, and antlr4 comes as source only.
 WHEELS = "--only-binary=:all: --no-binary=antlr4-python3-runtime"
-EXTRAS = "--extra=studio --extra=human --extra=video"
+EXTRAS = "--extra=studio --extra=video"
 LOWEST = "pip compile pyproject.toml -q --no-header --no-annotate --resolution=lowest-direct"
 TORCH = ("torch==", "triton==", "nvidia-", "cuda-")
 # An old package warns of a newer one that it uses: an error in the gate, none for who uses it.

@@ -22,9 +22,11 @@ read -ra master_options <<<"$MASTER_OPTIONS"
 read -ra worker_options <<<"$WORKER_OPTIONS"
 
 master=$(sbatch --parsable "${master_options[@]}" "$PROJECT/slurm/elastic/master.sbatch" "$@")
-code=() # a reward of one's own: code, which workers must be told, too
+code=() # code of one's own, which workers must be told, too
 for setting in "$@"; do
-    [[ $setting != reward.name=* ]] || code+=("$setting")
+    case $setting in
+        task=*.py:* | agent=*.py:* | task.imports=* | reward.name=*) code+=("$setting") ;;
+    esac
 done
 workers=$(sbatch --parsable --dependency="after:$master" --array="0-$WORKERS" \
     "${worker_options[@]}" "$PROJECT/slurm/elastic/workers.sbatch" "${code[@]}")
