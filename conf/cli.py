@@ -28,6 +28,7 @@ from conf.kinds import Kinds, kinds_of, with_usual_agent
 from conf.own import with_named_code, without_named_code
 from tangram_core.errors import ConfigError, TangramError
 from tangram_core.registry import TASK
+from tangram_core.run.code import names_modules, unquoted
 from tangram_core.settings import CONTROL
 
 if TYPE_CHECKING:
@@ -81,6 +82,9 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         kinds = kinds_of(arguments, folder, _stored_kinds(arguments))
         if TASK not in COMMANDS[config_name].groups:
             arguments = without_named_code(arguments)
+        elif stored is not None:  # the run that is joined says which modules; here they are named
+            known = setting_names(config_name, kinds)
+            arguments = [a for a in arguments if not names_modules(_key(a)) or _key(a) in known]
         options = [] if folder is None else [OWN_PRESETS[0], folder]
         _check_presets(folder)
         sys.argv[1:] = [*options, *options_first(arguments, config_name)]
@@ -344,7 +348,7 @@ def _sections_of_a_run(content: Plain, source: str) -> Plain:
 
 def _stored_kinds(arguments: Sequence[str]) -> Plain | None:
     """The config that the arguments name by `from_config`, if it can be read; else nothing yet."""
-    named = [text.partition("=")[2] for text in arguments if _key(text) == "from_config"]
+    named = [unquoted(text.partition("=")[2]) for text in arguments if _key(text) == "from_config"]
     if not named:
         return None
     try:

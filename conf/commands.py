@@ -261,7 +261,7 @@ With silhouette=cat.png it finds how tokens fill an outline first, see docs/silh
         (
             "tangram-play run_dir=runs/my_run out=tests.png episodes=20",
             "tangram-play puzzle=cat out=cat.gif",
-            "tangram-play silhouette=cat.png out=cat.mp4",
+            "tangram-play silhouette=cat.png out=cat_filled.gif",
         ),
         ("tangram_game.config:PlayConfig",),
         over=OVER,

@@ -6,11 +6,12 @@ GOODBYE_S=15 # for workers to leave after the master, before the job ends and ta
 
 RUN_DIR=$(realpath -m -- "$RUN_DIR")
 export PROJECT RUN_DIR RUN_WITH
+# shellcheck source-path=SCRIPTDIR source=code.sh
+source "$PROJECT/slurm/code.sh"
 # An image brings a PATH of its own.
 export PATH="$PROJECT/.venv/bin:$PATH"
 
 master=  # process of the srun that runs the master
-code=()  # code of one's own, which each process is told by name
 warned=  # 1 once the time limit is near
 
 say() {
@@ -41,16 +42,6 @@ begin_run() {
     [[ ! -e $RUN_DIR/result.json ]] || mv "$RUN_DIR/result.json" "$RUN_DIR/result.before.json"
     say "job $SLURM_JOB_ID, start $((${SLURM_RESTART_COUNT:-0} + 1)), run folder $RUN_DIR"
     trap warn_master USR1
-}
-
-# What workers must be told, too, of the settings of a master: code_of SETTING...
-code_of() {
-    local setting
-    for setting in "$@"; do
-        case $setting in
-            task=*.py:* | agent=*.py:* | task.imports=* | reward.name=*) code+=("$setting") ;;
-        esac
-    done
 }
 
 # The master as a step of its own: start_master [OPTION OF SRUN...] -- [SETTING...]

@@ -22,12 +22,9 @@ read -ra master_options <<<"$MASTER_OPTIONS"
 read -ra worker_options <<<"$WORKER_OPTIONS"
 
 master=$(sbatch --parsable "${master_options[@]}" "$PROJECT/slurm/elastic/master.sbatch" "$@")
-code=() # code of one's own, which workers must be told, too
-for setting in "$@"; do
-    case $setting in
-        task=*.py:* | agent=*.py:* | task.imports=* | reward.name=*) code+=("$setting") ;;
-    esac
-done
+# shellcheck source-path=SCRIPTDIR source=../code.sh
+source "$PROJECT/slurm/code.sh"
+code_of "$@"
 workers=$(sbatch --parsable --dependency="after:$master" --array="0-$WORKERS" \
     "${worker_options[@]}" "$PROJECT/slurm/elastic/workers.sbatch" "${code[@]}")
 echo "master: job $master, evaluator and workers: job $workers, run folder: $RUN_DIR"

@@ -80,8 +80,8 @@ class ServiceConfig(Settings, section="service"):
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
     threads: int = setting(
         1,
-        "torch threads of the master; more only on cores that nobody else uses: two are up to 1.8 "
-        "times as fast, and far slower than one where another process runs on theirs",
+        "torch threads of the master; more help on cores that nobody else uses, and are far slower "
+        "than one where another process runs on theirs",
         low=1,
         high=1024,
     )

@@ -13,7 +13,7 @@ import yaml
 from conf.cli import composed
 from tangram_core.registry import find_agent, find_task, load_own
 from tangram_core.run.code import code_of, override
-from tests.cluster.processes import LIMIT_S, refused, run_here, started, wait_for_file
+from tests.cluster.processes import LIMIT_S, refused, run, run_here, started, wait_for_file
 from tests.cluster.test_cli import READ
 from tests.core.examples import EXAMPLES
 
@@ -119,6 +119,28 @@ def test_a_module_is_imported_only_if_the_command_line_names_it(
     for named in (("from_config=config.yaml",), gym):
         told = refused("tangram-train", *named, "task.imports=[marks]", cwd=tmp_path)
         assert "cannot import marks (it was imported)" in told
+
+
+def test_a_module_of_ones_own_is_told_to_every_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    gym = (
+        "task=gym",
+        "task.id=Toy-v0",
+        "task.imports=[tests.core.toy]",
+        "agent.learning_starts=20",
+    )
+    run(
+        "tangram-train",
+        *gym,
+        "max_updates=2",
+        "service.eval_episodes=4",
+        "run_dir=it",
+        cwd=tmp_path,
+    )
+    result = json.loads((tmp_path / "it/result.json").read_text())
+    assert (result["task"], result["updates"]) == ("Toy-v0", 2)
 
 
 BROKEN = [

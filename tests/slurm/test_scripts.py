@@ -1,6 +1,7 @@
 """The job scripts as texts: what can be seen without SLURM."""
 
 import re
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -54,6 +55,15 @@ def test_scripts_stop_at_the_first_error_and_every_setting_is_one_of_the_config(
             if primary == "worker" and not any(word.startswith("connect=") for word in given):
                 given.append("connect=runs/x")
             composed(primary, with_named_code(given))
+
+
+def test_workers_are_told_of_code_and_of_nothing_else() -> None:
+    code = ["task=a.py:A", "agent.kind='b c.py:B'", "task.imports=[one,two]", "reward.name=r.py:f"]
+    plain = ["task=gym", "agent=goal", "task.id=a.py", "seed=1", "run_dir=a.py:A"]
+    script = 'source "$0"; code_of "$@"; printf "%s\\n" "${code[@]}"'
+    command = ["bash", "-euc", script, str(FOLDER / "code.sh"), *plain, *code]
+    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert told.splitlines() == code
 
 
 def test_settings_are_found() -> None:
