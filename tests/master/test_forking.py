@@ -29,14 +29,17 @@ def waiting(ended: "SimpleQueue[Child]") -> Child:
 
 
 def server() -> psutil.Process:
-    return psutil.Process(forkserver._forkserver._forkserver_pid)
+    pid = forkserver._forkserver._forkserver_pid
+    assert pid is not None  # psutil would take none for this process
+    return psutil.Process(pid)
 
 
 @pytest.fixture(autouse=True)
 def nobody_is_left() -> Iterator[None]:
     yield
-    for one in server().children():
-        one.kill()
+    if forkserver._forkserver._forkserver_pid is not None:
+        for one in server().children():
+            one.kill()
 
 
 def test_signals_to_a_whole_job_end_its_children_and_leave_the_server() -> None:
