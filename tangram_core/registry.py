@@ -27,6 +27,7 @@ OURS: dict[Role, dict[str, str]] = {
         "place": "tangram_tasks.place:Place",
         "fill": "tangram_tasks.fill:Fill",
         "gym": "tangram_tasks.gym.task:Gym",
+        "push": "tangram_tasks.push.task:Push",
     },
     "agent": {
         "scene": "tangram_agent.agents.scene.agent:Scene",

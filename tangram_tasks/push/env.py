@@ -1,0 +1,98 @@
+"""Tables on which a finger pushes tokens, several in step.
+
+Legend: B environments, K tokens, V corners.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Singles
+from tangram_core.spec import Arrays
+from tangram_core.task import Env, Generators, Step
+from tangram_tasks.push.places import AWAY, begin, push_of
+from tangram_tasks.push.table import PushTable, Unknowns
+
+if TYPE_CHECKING:
+    from tangram_tasks.push.task import Push
+
+
+class PushEnv(Env):
+    """B tables; see `Push`.
+
+    Attributes:
+        refused: (B,) why the last push moved nothing, empty where it could.
+    """
+
+    def __init__(self, task: "Push", count: int) -> None:
+        """Set up the tables."""
+        self.count, self._task = count, task
+        self.tables = [PushTable(task.layout, task.config.finger) for _ in range(count)]
+        shape = (count, task.layout.corner_count, 2)
+        self.corners: Floats = np.full(shape, AWAY)
+        self.goals: Floats = np.full(shape, AWAY)
+        self._present: Bools = np.zeros((count, task.layout.tokens), np.bool_)
+        self.refused = [""] * count
+
+    def reset(self, generators: Generators) -> Arrays:
+        """Lay out an episode on every table."""
+        layout = self._task.layout
+        for b, rng in enumerate(generators):
+            tokens, starts, goals = begin(layout, self._task.count, rng)
+            present, every, desired = self._present[b], *np.zeros((2, layout.tokens, 3))
+            present[:] = False
+            present[tokens], every[tokens], desired[tokens] = True, starts, goals
+            self.tables[b].place(every, present, self._drawn(rng))
+            self.goals[b] = self._corners(desired, present)
+            self.corners[b] = self._corners(every, present)
+        self.refused = [""] * self.count
+        return self._seen()
+
+    def step(self, actions: Singles) -> Step:
+        """Push once on every table."""
+        layout, config = self._task.layout, self._task.config
+        for b, action in enumerate(actions):
+            push = push_of(layout, self.corners[b], action, config.finger, config.longest)
+            self.refused[b] = push.refused
+            if not push.refused:
+                self.tables[b].push(push.begin, push.way)
+                self.corners[b] = self._corners(self.tables[b].poses(), self._present[b])
+        placed = self._task.placed(self.corners, self.goals)
+        rewards = self._task.paid(placed, self._present)
+        return Step(self._seen(), rewards, np.asarray(placed.all(axis=1)))
+
+    def facts(self) -> Arrays:
+        """Exact corners and goals, and whether the last push was refused."""
+        return {
+            "corners": self.corners.copy(),
+            "goals": self.goals.copy(),
+            "refused": np.array([bool(why) for why in self.refused]),
+        }
+
+    def close(self) -> None:
+        """End the engine's clients."""
+        for table in self.tables:
+            table.close()
+
+    def _drawn(self, rng: np.random.Generator) -> Unknowns:
+        """Frictions and centres of mass of an episode."""
+        layout, config = self._task.layout, self._task.config
+        tokens, own, finger = layout.tokens, config.table_friction, config.finger_friction
+        if config.friction == "fixed":
+            middle = np.full(tokens, np.mean(own))
+            return Unknowns(middle, float(np.mean(finger)), np.zeros((tokens, 2)))
+        angle, share = rng.uniform(-np.pi, np.pi, tokens), np.sqrt(rng.random(tokens))
+        around = share[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return Unknowns(
+            rng.uniform(own[0], own[1], tokens),
+            float(rng.uniform(finger[0], finger[1])),
+            config.centre * layout.radii[:, None] * around,
+        )
+
+    def _corners(self, poses: Floats, present: Bools) -> Floats:
+        corners = self._task.layout.corners(poses)
+        corners[~present[self._task.layout.token_of_corner]] = AWAY
+        return corners
+
+    def _seen(self) -> Arrays:
+        return {"corners": self.corners.copy(), "goals": self.goals.copy()}

@@ -1,0 +1,184 @@
+"""A finger pushes tokens into place; friction is drawn for each episode, and nobody is told.
+
+Legend: E episodes, T pushes of an episode, K tokens, V corners, n rows.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_core.errors import ConfigError
+from tangram_core.scores import Score
+from tangram_core.settings import NETWORK, Settings, setting
+from tangram_core.spec import Array, EpisodeSpec, Field
+from tangram_core.task import Env, Json, Played, Purpose, Task
+from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
+from tangram_tasks.push.places import ARENA, errors, on_table
+
+PER_TOKEN = 8  # pushes that an episode has for each token
+FURTHEST = 8.0  # of a corner: only what is wrong lies beyond
+PICTURES, PIXELS = 12, 216
+
+
+@dataclass(frozen=True)
+class PushConfig(Settings, section="task"):
+    """What lies on the table, what pushes it, and when it is in place."""
+
+    count: int = setting(
+        0,
+        "tokens on the table, drawn from the set for each episode; 0: all of it",
+        low=0,
+        high=16,
+        part=NETWORK,
+    )
+    within: float = setting(0.03, "distance at which a token is in its place", low=1e-4, high=1)
+    turned: float = setting(0.1, "turn within which it is", low=1e-4, high=4, unit="rad")
+    finger: float = setting(0.04, "the finger's radius", low=0.005, high=0.2)
+    longest: float = setting(0.5, "way of the longest push", low=0.05, high=2)
+    friction: str = setting(
+        "drawn",
+        "drawn: for each episode, from the ranges; fixed: the middle of the ranges, centres of "
+        "mass in the middle",
+        choices=("drawn", "fixed"),
+    )
+    table_friction: tuple[float, ...] = setting(
+        (0.3, 0.6), "range of the coefficient of each token on the table", low=0.05, high=2
+    )
+    finger_friction: tuple[float, ...] = setting(
+        (0.2, 1.2),
+        "range of the finger's; with a token it is multiplied by that one's",
+        low=0,
+        high=4,
+    )
+    centre: float = setting(
+        0.15, "largest distance of a centre of mass from the middle, in radii", low=0, high=0.5
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("table_friction", "finger_friction"):
+            value = getattr(self, name)
+            if len(value) != 2 or value[0] > value[1]:
+                raise ConfigError(
+                    f"task.{name} must be a range, got {[*value]}: write it as [0.3,0.6]"
+                )
+
+
+@dataclass(frozen=True)
+class Push(Task):
+    """Tokens on a table, and a finger that comes down, pushes along a straight line, and lifts.
+
+    An action is a push: which token, where on its edge, in which direction, how far. Where the
+    finger cannot come down nothing moves, and the push is spent. A push pays -1, and the share of
+    tokens that then are in place; an episode terminates when all are.
+    """
+
+    sections: ClassVar = {"tokens": TokensConfig, "task": PushConfig}
+    scores: ClassVar = (
+        Score("solved", "all in place, share"),
+        Score("placed", "tokens in place, share"),
+        Score("coverage", "covered"),
+        Score("pushes", "pushes", digits=1),
+        Score("refused", "pushes refused", digits=2),
+        Score("decision_ms", "a decision", digits=1, unit=" ms"),
+    )
+    tokens: TokensConfig
+    config: PushConfig = PushConfig()
+
+    def __post_init__(self) -> None:
+        """Refuse more tokens than there are."""
+        if self.config.count > self.layout.tokens:
+            raise ConfigError(
+                f"task.count={self.config.count} of {self.layout.tokens} tokens: set it to at most "
+                f"{self.layout.tokens}, or take a larger set, as in tokens=tangram7"
+            )
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The token set's fixed structure."""
+        return make_layout(self.tokens)
+
+    @property
+    def count(self) -> int:
+        """Tokens of an episode."""
+        return self.config.count or self.layout.tokens
+
+    @property
+    def spec(self) -> EpisodeSpec:
+        """Corners of all tokens, and where they should come; AWAY where one is not there."""
+        shape = (self.layout.corner_count, 2)
+        fields = (
+            Field("corners", shape, -FURTHEST, FURTHEST),
+            Field("goals", shape, -FURTHEST, FURTHEST, "episode"),
+        )
+        horizon = PER_TOKEN * self.count
+        return EpisodeSpec(horizon, 4, fields, "corners", "goals", rewards=(-1.0, 0.0))
+
+    def placed(self, achieved: Array, desired: Array) -> Bools:
+        """(n, K) which tokens are in place, or not on the table."""
+        corners, goals = achieved.astype(np.float64), desired.astype(np.float64)
+        distance, turn = errors(self.layout, corners, goals)
+        near = (distance <= self.config.within) & (turn <= self.config.turned)
+        return near | ~on_table(goals, self.layout)
+
+    def paid(self, placed: Bools, present: Bools) -> Floats:
+        """(n,) -1 and the share of tokens in place."""
+        counts = present.sum(axis=1)
+        share: Floats = (placed & present).sum(axis=1) / np.maximum(counts, 1)
+        return share - 1.0
+
+    def rewards(self, achieved: Array, desired: Array) -> Floats:
+        """(n,) of corners (n, V, 2)."""
+        return self.paid(self.placed(achieved, desired), on_table(desired, self.layout))
+
+    def ended(self, achieved: Array, desired: Array, recorded: Bools) -> Bools:  # noqa: ARG002
+        """(n,) whether all are in place."""
+        return np.asarray(self.placed(achieved, desired).all(axis=1))
+
+    def make(self, count: int, purpose: Purpose = "play") -> Env:  # noqa: ARG002
+        """So many tables in this process."""
+        from tangram_tasks.push.env import PushEnv  # noqa: PLC0415
+
+        return PushEnv(self, count)
+
+    def score(self, played: Played) -> dict[str, float]:
+        """Of the moment at which all were in place first, or of the end."""
+        from tangram_sim.geometry.overlap import overlap_area  # noqa: PLC0415
+
+        terminated = played.episodes.terminated.astype(bool)
+        count, horizon = terminated.shape
+        solved = terminated.any(axis=1)
+        last = np.where(solved, terminated.argmax(axis=1) + 1, horizon)
+        rows = np.arange(count)
+        ends, goals = played.facts["corners"][rows, last], played.facts["goals"][:, 0]
+        present = on_table(goals, self.layout)
+        areas = (present * self.layout.areas).sum(axis=1)
+        counts = np.arange(1, horizon + 1) <= last[:, None]
+        refused = played.facts["refused"][:, 1:].astype(bool) & counts
+        return {
+            "solved": float(solved.mean()),
+            "placed": float(1.0 + self.paid(self.placed(ends, goals), present).mean()),
+            "coverage": float((overlap_area(ends, goals, self.layout) / areas).mean()),
+            "pushes": float(last.mean()),
+            "refused": float(refused.sum(axis=1).mean()),
+            "decision_ms": float(1e3 * played.slowest.mean()),
+        }
+
+    def draw(self, played: Played) -> Pixels:
+        """How the first episodes end."""
+        from tangram_sim.drawing.scenes import episode_sheet  # noqa: PLC0415
+
+        corners, goals = played.facts["corners"][:PICTURES], played.facts["goals"][:PICTURES, 0]
+        sheet = episode_sheet(self.layout, ARENA, corners[:, 0], corners[:, -1], goals, 4, PIXELS)
+        return np.asarray(sheet.convert("RGB"))
+
+    def identity(self) -> Json:
+        """Tokens by what makes them."""
+        return super().identity() | {"tokens": {"layout": self.layout.fingerprint()}}
+
+    def facts(self) -> Json:
+        """How many tokens there are."""
+        return {"task": f"push of {self.count}"}
