@@ -159,7 +159,7 @@ def _run(
     def job(config: DictConfig) -> None:
         gc.enable()
         try:
-            statuses.append(task(_plain(config, stored, config_name)))
+            statuses.append(task(_plain(config, stored, config_name, kinds)))
         except (TangramError, OSError, MemoryError) as error:
             # An exception that hydra sees costs two more lines; an exit passes through it.
             errors.append(_as_ours(error))
@@ -219,7 +219,7 @@ def _as_ours(error: Exception) -> TangramError:
     )
 
 
-def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
+def _plain(config: Any, stored: Stored | None, config_name: str, kinds: Kinds) -> Plain:
     """Hydra's config as plain containers, with nothing missing and everything resolved.
 
     Raises:
@@ -237,12 +237,12 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
         raise ConfigError(f"cannot resolve the config: {_first_line(error)}") from None
     if missing:
         raise ConfigError(MISSING_HINTS.get(missing[0], f"set {missing[0]}=..., it has no default"))
-    plain = _mapping(settings)
+    overrides = list(HydraConfig.get().overrides.task)
+    plain = _own(_mapping(settings), overrides, kinds)
     in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN and config_name in MAKE_RUNS
     if in_sweep and isinstance(plain.get("run_dir"), str):
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
-    overrides = list(HydraConfig.get().overrides.task)
     return with_named_reward(with_run_config(plain, overrides, stored), overrides)
 
 
@@ -260,14 +260,28 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
 
     if config_name in MAKE_RUNS:
         overrides = with_usual_agent(overrides)
-    _register(config_name, kinds_of(overrides))
+    kinds = kinds_of(overrides)
+    _register(config_name, kinds)
     alone = not GlobalHydra().is_initialized()
     try:
         with hydra.initialize_config_module("conf", version_base="1.3") if alone else nullcontext():
             config = hydra.compose(config_name, list(overrides))
-        return _mapping(OmegaConf.to_container(config, resolve=True))
+        return _own(_mapping(OmegaConf.to_container(config, resolve=True)), overrides, kinds)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_explain(error, config_name, kinds_of(overrides))) from error
+        raise ConfigError(_explain(error, config_name, kinds)) from error
+
+
+def _own(settings: Plain, overrides: Sequence[str], kinds: Kinds) -> Plain:
+    """The settings that task and agent have: a set of tokens may bring those of a world, too.
+
+    Raises:
+        ConfigError: an argument sets one that they have not.
+    """
+    other = {*GROUPS} - {*kinds.sections()}
+    for name in map(_key, overrides):
+        if name.partition(".")[0] in other:
+            raise ConfigError(f"{name} is no setting of task={kinds.task}: leave it out")
+    return {name: value for name, value in settings.items() if name not in other}
 
 
 def _register(config_name: str, kinds: Kinds) -> None:

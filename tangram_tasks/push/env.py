@@ -77,14 +77,18 @@ class PushEnv(Env):
     def _drawn(self, rng: np.random.Generator) -> Unknowns:
         """Frictions and centres of mass of an episode."""
         layout, config = self._task.layout, self._task.config
-        tokens, own, finger = layout.tokens, config.table_friction, config.finger_friction
+        tokens, own = layout.tokens, config.table_friction
+        spread, finger = config.spread, config.finger_friction
         if config.friction == "fixed":
-            middle = np.full(tokens, np.mean(own))
-            return Unknowns(middle, float(np.mean(finger)), np.zeros((tokens, 2)))
+            alike = np.ones(tokens)
+            return Unknowns(
+                alike, np.mean(spread) * alike, float(np.mean(finger)), np.zeros((tokens, 2))
+            )
         angle, share = rng.uniform(-np.pi, np.pi, tokens), np.sqrt(rng.random(tokens))
         around = share[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return Unknowns(
             rng.uniform(own[0], own[1], tokens),
+            rng.uniform(spread[0], spread[1], tokens),
             float(rng.uniform(finger[0], finger[1])),
             config.centre * layout.radii[:, None] * around,
         )

@@ -1,10 +1,14 @@
-"""Tokens on a table in PyBullet, and a finger that pushes them.
+"""Tokens on a table in PyBullet, and a finger that pushes them slowly.
 
-Lengths are arena units, in which the table is 2 wide. A push is slow: a token stops as soon as
-nothing pushes it. Such motion is the same however fast time runs, as long as friction is much more
-than inertia; so the engine's finger is quick and its gravity strong, and a push takes few steps.
+A push is quasi-static: friction is much more than inertia, and a token moves as far as something
+pushes it. The table's friction resists like an ellipsoid of force and moment (the limit surface of
+Goyal et al. 1991 as Lee and Cutkosky 1991 approximate it): then what moves, and how, is what the
+engine makes of contacts between bodies that forget their speed in every step, whose mass is the
+friction's strength, whose inertia is its moment, and whose centre of mass is the centre of
+pressure. Coulomb friction in the engine itself, with gravity, comes to nearly the same and needs
+steps a tenth as long.
 
-Legend: K tokens.
+Lengths are arena units, in which the table is 2 wide. Legend: K tokens.
 """
 
 import math
@@ -20,14 +24,15 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.prisms import inset, prism
 from tangram_sim.world.engine import pybullet
 
-_HALF_HEIGHT = 0.05  # of a token
+# Of a token as it collides: so tall that the shortest way out of another is always sideways.
+_WALL = 0.25
 _MARGIN = 1e-3  # of what collides, which is smaller by it on every side
-_SPEED = 1.0  # of the finger, units/s
-_GRAVITY = 100.0  # units/s^2: a token that is let go stops within _SPEED^2 / (2 mu _GRAVITY)
-_STEP_S = 1.0 / 120.0
-_REST_STEPS = 8  # until nothing moves any more
+_STEP = 1.0 / 120.0  # way of the finger in one step
+_ITERATIONS = 20  # of the engine's solver; 50 are its default
+_STIFF = 1e4  # inertia about x and y, far more than a token's: none tips over
 _FORCE = 1e4  # of the finger's motors: nothing that is pushed slows it down
-_ABOVE = 1.0  # height of the finger while it does not push
+_ABOVE = 2.0  # height of the finger while it does not push
+_TOKENS = 0.5  # coefficient of a token, which the engine multiplies with the other's
 _NONE, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
@@ -36,12 +41,15 @@ class Unknowns:
     """What is drawn for an episode, and told to nobody.
 
     Attributes:
-        table: (K,) coefficients of friction of table and token.
-        finger: of finger and token.
+        table: (K,) coefficients of friction of table and token; only their ratios count.
+        spread: (K,) square of the friction's lever, in squares of the token's radius of gyration:
+            .9 where it is pressed alike everywhere, 2 and more where its corners carry it.
+        finger: coefficient of friction of finger and token.
         centres: (K, 2) from each token's centre of area to its centre of mass, in its own frame.
     """
 
     table: Floats
+    spread: Floats
     finger: float
     centres: Floats
 
@@ -57,10 +65,8 @@ class PushTable:
             finger: its radius.
         """
         self._layout, self._finger = layout, finger
-        self._prisms = [
-            prism(inset(shape.corners, _MARGIN), _HALF_HEIGHT - _MARGIN)[0]
-            for shape in layout.shapes
-        ]
+        self._prisms = [prism(inset(shape.corners, _MARGIN), _WALL)[0] for shape in layout.shapes]
+        self._gyration = [_gyration(shape.corners) for shape in layout.shapes]
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise TangramError(
@@ -77,14 +83,15 @@ class PushTable:
         on the one before it.
         """
         self._call("resetSimulation")
-        self._call("setGravity", 0.0, 0.0, -_GRAVITY)
-        self._call("setPhysicsEngineParameter", deterministicOverlappingPairs=1)
-        ground, self._pusher = self._make_ground(), self._make_finger(unknowns.finger)
-        self._call("setCollisionFilterPair", ground, self._pusher, -1, 2, 0)
+        self._call(
+            "setPhysicsEngineParameter",
+            numSolverIterations=_ITERATIONS,
+            deterministicOverlappingPairs=1,
+        )
+        self._pusher = self._make_finger(unknowns.finger / _TOKENS)
         self._centres = unknowns.centres
         self._bodies = {
-            token: self._make_token(token, float(unknowns.table[token]))
-            for token in np.flatnonzero(present).tolist()
+            token: self._make_token(token, unknowns) for token in np.flatnonzero(present).tolist()
         }
         for token in self._bodies:
             self._put(token, poses[token])
@@ -93,11 +100,18 @@ class PushTable:
         """Bring the finger down at `begin` (2,), move it by `way` (2,), and lift it."""
         length = math.hypot(*way)
         self._finger_at(begin[0], begin[1], 0.0)
-        self._drive(way[0] / length * _SPEED, way[1] / length * _SPEED)
-        self._run(max(1, math.ceil(length / _SPEED / _STEP_S)), length / _SPEED)
-        self._finger_at(0.0, 0.0, _ABOVE)
-        self._drive(0.0, 0.0)
-        self._run(_REST_STEPS, _REST_STEPS * _STEP_S)
+        self._call(  # a unit in a second
+            "setJointMotorControlArray",
+            self._pusher,
+            (0, 1, 2),
+            pybullet.VELOCITY_CONTROL,
+            targetVelocities=(way[0] / length, way[1] / length, 0.0),
+            forces=(_FORCE, _FORCE, _FORCE),
+        )
+        steps = max(1, math.ceil(length / _STEP))
+        self._call("setPhysicsEngineParameter", fixedTimeStep=length, numSubSteps=steps)
+        self._call("stepSimulation")
+        self._finger_at(begin[0], begin[1], _ABOVE)
         for token in self._bodies:
             self._put(token, self._pose(token))
 
@@ -115,29 +129,15 @@ class PushTable:
     def _call(self, name: str, *given: Any, **named: Any) -> Any:
         return getattr(pybullet, name)(*given, **named, physicsClientId=self._client)
 
-    def _run(self, steps: int, seconds: float) -> None:
-        self._call("setPhysicsEngineParameter", fixedTimeStep=seconds, numSubSteps=steps)
-        self._call("stepSimulation")
-
     def _finger_at(self, x: float, y: float, height: float) -> None:
         for joint, value in enumerate((x, y, height)):
             self._call("resetJointState", self._pusher, joint, value, 0.0)
-
-    def _drive(self, x: float, y: float) -> None:
-        self._call(
-            "setJointMotorControlArray",
-            self._pusher,
-            (0, 1, 2),
-            pybullet.VELOCITY_CONTROL,
-            targetVelocities=(x, y, 0.0),
-            forces=(_FORCE, _FORCE, _FORCE),
-        )
 
     def _put(self, token: int, pose: Floats) -> None:
         """Lay a token down, at rest; the engine asks where its centre of mass is."""
         x, y, angle = np.asarray(pose).tolist()
         right, up = self._shift(token, angle)
-        place = (x + right, y + up, _HALF_HEIGHT)
+        place = (x + right, y + up, 0.0)
         turn = (0.0, 0.0, math.sin(angle / 2.0), math.cos(angle / 2.0))
         self._call("resetBasePositionAndOrientation", self._bodies[token], place, turn)
         self._call("resetBaseVelocity", self._bodies[token], _NONE, _NONE)
@@ -154,29 +154,27 @@ class PushTable:
         cos, sin = math.cos(angle), math.sin(angle)
         return cos * x - sin * y, sin * x + cos * y
 
-    def _make_ground(self) -> int:
-        box = self._call("createCollisionShape", pybullet.GEOM_BOX, halfExtents=(9.0, 9.0, 0.5))
-        ground: int = self._call("createMultiBody", 0.0, box, basePosition=(0.0, 0.0, -0.5))
-        self._call("changeDynamics", ground, -1, lateralFriction=1.0)  # the engine multiplies
-        return ground
-
-    def _make_token(self, token: int, friction: float) -> int:
+    def _make_token(self, token: int, unknowns: Unknowns) -> int:
         mesh = self._call("createCollisionShape", pybullet.GEOM_MESH, vertices=self._prisms[token])
+        strength = float(unknowns.table[token]) * self._layout.shapes[token].area
         body: int = self._call(
             "createMultiBody",
-            self._layout.shapes[token].area,
+            strength,
             mesh,
             baseInertialFramePosition=(*self._centres[token].tolist(), 0.0),
             useMaximalCoordinates=True,
         )
+        moment = strength * float(unknowns.spread[token] * self._gyration[token])
         self._call(
             "changeDynamics",
             body,
             -1,
-            lateralFriction=friction,
+            mass=strength,
+            localInertiaDiagonal=(_STIFF, _STIFF, moment),
+            lateralFriction=_TOKENS,
             collisionMargin=_MARGIN,
-            linearDamping=0.0,
-            angularDamping=0.0,
+            linearDamping=1.0,
+            angularDamping=1.0,
         )
         return body
 
@@ -186,13 +184,13 @@ class PushTable:
             "createCollisionShape",
             pybullet.GEOM_CYLINDER,
             radius=self._finger,
-            height=_HALF_HEIGHT,
+            height=2.0 * _WALL,
         )
         three = range(3)
         finger: int = self._call(
             "createMultiBody",
             0.0,
-            basePosition=(0.0, 0.0, _HALF_HEIGHT),
+            basePosition=_NONE,
             linkMasses=[1.0 for _ in three],
             linkCollisionShapeIndices=[-1, -1, cylinder],
             linkVisualShapeIndices=[-1 for _ in three],
@@ -206,3 +204,11 @@ class PushTable:
         )
         self._call("changeDynamics", finger, 2, lateralFriction=friction)
         return finger
+
+
+def _gyration(corners: Floats) -> float:
+    """Square of the radius of gyration of a polygon (V, 2) about its centre of area, the origin."""
+    following = np.roll(corners, -1, axis=0)
+    twice = corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]
+    squares = (corners**2 + corners * following + following**2).sum(axis=1)
+    return float((twice * squares).sum() / (6.0 * twice.sum()))

@@ -45,13 +45,20 @@ class PushConfig(Settings, section="task"):
         choices=("drawn", "fixed"),
     )
     table_friction: tuple[float, ...] = setting(
-        (0.3, 0.6), "range of the coefficient of each token on the table", low=0.05, high=2
+        (0.5, 1.5),
+        "range of each token's friction on the table; only ratios count",
+        low=0.01,
+        high=100,
+    )
+    spread: tuple[float, ...] = setting(
+        (0.9, 2.0),
+        "range of the squared lever of that friction, in squared radii of gyration: 0.9 where a "
+        "token is pressed alike everywhere, 2 and more where its corners carry it",
+        low=0.1,
+        high=5,
     )
     finger_friction: tuple[float, ...] = setting(
-        (0.2, 1.2),
-        "range of the finger's; with a token it is multiplied by that one's",
-        low=0,
-        high=4,
+        (0.1, 0.6), "range of the coefficient of finger and token", low=0, high=2
     )
     centre: float = setting(
         0.15, "largest distance of a centre of mass from the middle, in radii", low=0, high=0.5
@@ -59,11 +66,11 @@ class PushConfig(Settings, section="task"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("table_friction", "finger_friction"):
+        for name in ("table_friction", "spread", "finger_friction"):
             value = getattr(self, name)
             if len(value) != 2 or value[0] > value[1]:
                 raise ConfigError(
-                    f"task.{name} must be a range, got {[*value]}: write it as [0.3,0.6]"
+                    f"task.{name} must be a range, got {[*value]}: write it as [0.5,1.5]"
                 )
 
 
@@ -164,7 +171,7 @@ class Push(Task):
             "coverage": float((overlap_area(ends, goals, self.layout) / areas).mean()),
             "pushes": float(last.mean()),
             "refused": float(refused.sum(axis=1).mean()),
-            "decision_ms": float(1e3 * played.slowest.mean()),
+            "decision_ms": float(1e3 * played.slowest.mean()) if len(played.slowest) else 0.0,
         }
 
     def draw(self, played: Played) -> Pixels:
