@@ -22,6 +22,7 @@ class PushEnv(Env):
 
     Attributes:
         refused: (B,) why the last push moved nothing, empty where it could.
+        unknowns: (B,) what was drawn for the episode: for planners that are told.
     """
 
     def __init__(self, task: "Push", count: int) -> None:
@@ -33,6 +34,7 @@ class PushEnv(Env):
         self.goals: Floats = np.full(shape, AWAY)
         self._present: Bools = np.zeros((count, task.layout.tokens), np.bool_)
         self.refused = [""] * count
+        self.unknowns = [self.middle] * count
 
     def reset(self, generators: Generators) -> Arrays:
         """Lay out an episode on every table."""
@@ -42,9 +44,10 @@ class PushEnv(Env):
             present, every, desired = self._present[b], *np.zeros((2, layout.tokens, 3))
             present[:] = False
             present[tokens], every[tokens], desired[tokens] = True, starts, goals
-            self.tables[b].place(every, present, self._drawn(rng))
-            self.goals[b] = self._corners(desired, present)
-            self.corners[b] = self._corners(every, present)
+            self.unknowns[b] = self._drawn(rng)
+            self.tables[b].place(every, present, self.unknowns[b])
+            self.goals[b] = self.corners_of(desired, present)
+            self.corners[b] = self.corners_of(every, present)
         self.refused = [""] * self.count
         return self._seen()
 
@@ -56,7 +59,7 @@ class PushEnv(Env):
             self.refused[b] = push.refused
             if not push.refused:
                 self.tables[b].push(push.begin, push.way)
-                self.corners[b] = self._corners(self.tables[b].poses(), self._present[b])
+                self.corners[b] = self.corners_of(self.tables[b].poses(), self._present[b])
         placed = self._task.placed(self.corners, self.goals)
         rewards = self._task.paid(placed, self._present)
         return Step(self._seen(), rewards, np.asarray(placed.all(axis=1)))
@@ -74,16 +77,20 @@ class PushEnv(Env):
         for table in self.tables:
             table.close()
 
+    @property
+    def middle(self) -> Unknowns:
+        """The middle of what is drawn."""
+        config, alike = self._task.config, np.ones(self._task.layout.tokens)
+        spread, finger = float(np.mean(config.spread)), float(np.mean(config.finger_friction))
+        return Unknowns(alike, spread * alike, finger, np.zeros((len(alike), 2)))
+
     def _drawn(self, rng: np.random.Generator) -> Unknowns:
         """Frictions and centres of mass of an episode."""
         layout, config = self._task.layout, self._task.config
         tokens, own = layout.tokens, config.table_friction
         spread, finger = config.spread, config.finger_friction
         if config.friction == "fixed":
-            alike = np.ones(tokens)
-            return Unknowns(
-                alike, np.mean(spread) * alike, float(np.mean(finger)), np.zeros((tokens, 2))
-            )
+            return self.middle
         angle, share = rng.uniform(-np.pi, np.pi, tokens), np.sqrt(rng.random(tokens))
         around = share[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return Unknowns(
@@ -93,7 +100,8 @@ class PushEnv(Env):
             config.centre * layout.radii[:, None] * around,
         )
 
-    def _corners(self, poses: Floats, present: Bools) -> Floats:
+    def corners_of(self, poses: Floats, present: Bools) -> Floats:
+        """(V, 2) of poses (K, 3); AWAY those that are not on the table."""
         corners = self._task.layout.corners(poses)
         corners[~present[self._task.layout.token_of_corner]] = AWAY
         return corners

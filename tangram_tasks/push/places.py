@@ -78,9 +78,8 @@ def push_of(
     if (np.abs(begin) > edge).any():
         return Push(begin, way, "the table ends there")
     way = length * np.array([direction.real, direction.imag])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        room = np.where(way > 0.0, edge - begin, -edge - begin) / way
-    way = way * min(1.0, float(np.nanmin(room)))
+    room = edge - np.sign(way) * begin  # in each direction, to where the finger would leave
+    way = way * min(1.0, *(room / np.maximum(np.abs(way), 1e-9)).tolist())
     clear = _distances(layout, corners, begin)
     clear[token] = np.inf
     if clear.min() < finger:

@@ -93,6 +93,10 @@ class PushTable:
         self._bodies = {
             token: self._make_token(token, unknowns) for token in np.flatnonzero(present).tolist()
         }
+        self.lay(poses)
+
+    def lay(self, poses: Floats) -> None:
+        """Move the tokens on the table to poses (K, 3); the engine keeps what it kept."""
         for token in self._bodies:
             self._put(token, poses[token])
 

@@ -3,9 +3,10 @@
 Legend: E episodes, T pushes of an episode, K tokens, V corners, n rows.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
@@ -14,9 +15,12 @@ from tangram_core.errors import ConfigError
 from tangram_core.scores import Score
 from tangram_core.settings import NETWORK, Settings, setting
 from tangram_core.spec import Array, EpisodeSpec, Field
-from tangram_core.task import Env, Json, Played, Purpose, Task
+from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
 from tangram_tasks.push.places import ARENA, errors, on_table
+
+if TYPE_CHECKING:
+    from tangram_tasks.push.env import PushEnv
 
 PER_TOKEN = 8  # pushes that an episode has for each token
 FURTHEST = 8.0  # of a corner: only what is wrong lies beyond
@@ -150,6 +154,17 @@ class Push(Task):
         from tangram_tasks.push.env import PushEnv  # noqa: PLC0415
 
         return PushEnv(self, count)
+
+    def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
+        """Chance, what was tried of each shape alone, and what an engine of one's own finds."""
+        from tangram_tasks.push.rivals import Planner, Search  # noqa: PLC0415
+        from tangram_tasks.push.table_rival import Lookup  # noqa: PLC0415
+
+        return {
+            "random": super().rivals()["random"],
+            "table": lambda env: Lookup(self, cast("PushEnv", env)),
+            "planner": lambda env: Planner(self, cast("PushEnv", env), Search()),
+        }
 
     def score(self, played: Played) -> dict[str, float]:
         """Of the moment at which all were in place first, or of the end."""

@@ -1,0 +1,175 @@
+"""A rule that learns nothing: random pushes of each shape alone, tried once, and looked up.
+
+What a push does to a token that lies alone is written down in the token's own frame, at the middle
+of what is unknown. A decision looks for the push, or the two pushes, after which least is left to
+go, among those that keep finger and token clear of the others.
+
+Legend: N pushes of a shape, n of them, K tokens, V corners, C corners of a token.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Ints, Singles
+from tangram_core.spec import Arrays
+from tangram_core.task import Generators, History
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines_at, shared_area
+from tangram_sim.geometry.shapes import Shape
+from tangram_tasks.push.places import on_table, push_of
+from tangram_tasks.push.table import PushTable, Unknowns
+
+if TYPE_CHECKING:
+    from tangram_tasks.push.env import PushEnv
+    from tangram_tasks.push.task import Push
+
+PUSHES = 3000  # of each shape
+FIRST, SECOND = 120, 1000  # that are followed in thought, half the best, half any; and by these
+CLEAR = 0.02  # share of a token that may come to lie on another: it is pushed aside a little
+WAY_POINTS = 4  # of a token's way that are looked at
+BLOCKED = 1e3  # cost of a push that is not clear
+
+
+@dataclass(frozen=True, eq=False)
+class Pushes:
+    """What random pushes do to a shape that lies alone.
+
+    Attributes:
+        actions: (N, 3) where, turn, far.
+        moved: (N, 3) x, y and turn of the token in its own frame.
+        begins, ends: (N, 2) of the finger, there.
+    """
+
+    actions: Floats
+    moved: Floats
+    begins: Floats
+    ends: Floats
+
+
+@lru_cache(maxsize=64)
+def tried(shape: Shape, finger: float, longest: float, friction: float, spread: float) -> Pushes:
+    """Random pushes of a shape; some seconds when they are asked for first."""
+    layout, rng = Layout([shape]), np.random.default_rng(0)
+    table, present = PushTable(layout, finger), np.ones(1, np.bool_)
+    middle = Unknowns(np.ones(1), np.full(1, spread), friction, np.zeros((1, 2)))
+    table.place(np.zeros((1, 3)), present, middle)
+    actions, moved = rng.uniform(-1.0, 1.0, (PUSHES, 3)), np.zeros((PUSHES, 3))
+    begins, ends = np.zeros((2, PUSHES, 2))
+    corners = layout.corners(np.zeros((1, 3)))
+    for i, action in enumerate(actions):
+        push = push_of(layout, corners, np.append(0.0, action), finger, longest)
+        table.lay(np.zeros((1, 3)))
+        table.push(push.begin, push.way)
+        moved[i], begins[i], ends[i] = table.poses()[0], push.begin, push.begin + push.way
+    table.close()
+    return Pushes(actions, moved, begins, ends)
+
+
+def after(errors: Floats, moved: Floats) -> Floats:
+    """(..., 3) ways that are left, in the frames of tokens that moved by (..., 3) in theirs."""
+    left = (errors[..., :2] - moved[..., :2]) @ (1.0, 1j) * np.exp(-1j * moved[..., 2])
+    return np.stack([left.real, left.imag, errors[..., 2] - moved[..., 2]], axis=-1)
+
+
+class Lookup:
+    """Chooses by what was tried of each shape alone."""
+
+    def __init__(self, task: "Push", env: "PushEnv") -> None:
+        middle, config = env.middle, task.config
+        self._task, self._layout = task, task.layout
+        self._tried = [
+            tried(one, config.finger, config.longest, middle.finger, float(middle.spread[0]))
+            for one in task.layout.shapes
+        ]
+        self._periods = 2.0 * np.pi / task.layout.symmetries
+
+    def __call__(self, seen: Arrays, past: History, generators: Generators) -> Singles:  # noqa: ARG002
+        """(B, 4) the push after which least is left to go."""
+        rows = zip(seen["corners"], seen["goals"], generators, strict=True)
+        return np.stack([self._best(*row) for row in rows]).astype(np.float32)
+
+    def _best(self, corners: Floats, goals: Floats, rng: np.random.Generator) -> Floats:
+        task, layout = self._task, self._layout
+        corners, goals = np.asarray(corners, np.float64), np.asarray(goals, np.float64)
+        present, poses, desired = (
+            on_table(goals, layout),
+            layout.poses(corners),
+            layout.poses(goals),
+        )
+        placed = task.placed(corners[None], goals[None])[0]
+        best, least = np.zeros(4), np.inf
+        for token in np.flatnonzero(present & ~placed).tolist():
+            way = (desired[token, :2] - poses[token, :2]) @ (1.0, 1j)
+            way = way * np.exp(-1j * poses[token, 2])
+            error = np.array([way.real, way.imag, desired[token, 2] - poses[token, 2]])
+            chosen, costs = self._ranked(token, error, rng)
+            clear = self._clear(token, chosen, poses, present)
+            costs = np.where(clear, costs, costs + BLOCKED) - self._cost(token, error[None])[0]
+            i = int(costs.argmin())
+            if costs[i] < least:
+                named = (token + 0.5) / layout.tokens * 2.0 - 1.0
+                best, least = np.array([named, *self._tried[token].actions[chosen[i]]]), costs[i]
+        return best
+
+    def _ranked(self, token: int, error: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
+        """Pushes (n,), and what is left after them and the best that may follow."""
+        moved = self._tried[token].moved
+        first = after(error, moved)
+        costs = self._cost(token, first)
+        order = np.argsort(costs)
+        any_of = rng.integers(PUSHES, size=FIRST // 2)
+        chosen = np.concatenate([order[: FIRST // 2], any_of])
+        second = self._cost(token, after(first[chosen][:, None], moved[None, :SECOND])).min(axis=1)
+        one = costs[chosen]
+        return chosen, np.where(one <= 1.0, one, 1.0 + second)
+
+    def _cost(self, token: int, errors: Floats) -> Floats:
+        """(...) of ways that are left (..., 3), in tolerances."""
+        period, config = self._periods[token], self._task.config
+        turn = errors[..., 2] - period * np.round(errors[..., 2] / period)
+        far = np.hypot(errors[..., 0], errors[..., 1]) / config.within
+        cost: Floats = np.hypot(far, turn / config.turned)
+        return cost
+
+    def _clear(self, token: int, chosen: Ints, poses: Floats, present: Bools) -> Bools:
+        """(n,) whether finger and token keep clear of the other tokens, and of the table's edge."""
+        own, layout = self._tried[token], self._layout
+        turn, place = np.exp(1j * poses[token, 2]), poses[token, :2] @ (1.0, 1j)
+        begin, end = (place + turn * (at[chosen] @ (1.0, 1j)) for at in (own.begins, own.ends))
+        edge = 1.0 - self._task.config.finger
+        clear = np.ones(len(chosen), np.bool_)
+        for at in (begin, end):
+            clear &= np.maximum(np.abs(at.real), np.abs(at.imag)) <= edge
+        others = [k for k in np.flatnonzero(present).tolist() if k != token]
+        if not others:
+            return clear
+        bodies = layout.body[layout.padded_corners]
+        sides = np.zeros(len(others), np.bool_)
+        outlines = outlines_at(bodies[others], poses[others], sides)
+        for share in np.arange(1, WAY_POINTS + 1) / WAY_POINTS:
+            moved = own.moved[chosen] * share
+            at = place + turn * (moved[:, :2] @ (1.0, 1j))
+            whole = np.stack([at.real, at.imag, poses[token, 2] + moved[:, 2]], axis=1)
+            laid = outlines_at(bodies[token], whole, np.zeros(len(whole), np.bool_))
+            finger = begin + share * (end - begin)
+            for outline in outlines:
+                pairs = np.broadcast_to(outline, laid.shape)
+                clear &= shared_area(laid, pairs) <= CLEAR * layout.areas[token]
+                clear &= apart(outline @ (1.0, 1j), finger) >= self._task.config.finger
+        for outline in outlines:
+            clear &= apart(outline @ (1.0, 1j), begin) >= self._task.config.finger
+        return clear
+
+
+def apart(outline: Floats, points: Floats) -> Floats:
+    """(n,) distances of points to a convex polygon (C,), 0 inside; both complex numbers."""
+    edges = np.roll(outline, -1) - outline
+    squares = np.abs(edges) ** 2
+    to = points[:, None] - outline
+    share = np.clip((edges.conj() * to).real / np.where(squares > 0.0, squares, 1.0), 0.0, 1.0)
+    inside = ((edges.conj() * to).imag >= 0.0).all(axis=1)
+    found: Floats = np.where(inside, 0.0, np.abs(to - share * edges).min(axis=1))
+    return found

@@ -1,0 +1,206 @@
+"""Tokens that a finger pushes: what a push is, where they come, and who learned nothing."""
+
+from contextlib import closing
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tangram_tasks.push.table as table_module
+import tangram_tasks.push.table_rival as rival_module
+from tangram_core.conformance import check_task, play
+from tangram_core.errors import ConfigError
+from tangram_core.seeding import episode_generator
+from tangram_core.spec import Arrays
+from tangram_core.task import History
+from tangram_sim.geometry.layout import TokensConfig
+from tangram_tasks.push.places import AWAY, push_of
+from tangram_tasks.push.table import PushTable, Unknowns
+from tangram_tasks.push.task import Push, PushConfig
+from tests.sim.builders import SEVEN
+
+pytestmark = pytest.mark.fast
+
+SCALE = 0.8 * 2**0.5  # the square's side is 0.4
+SQUARE = Push(TokensConfig(("square",), SCALE))
+TWO = Push(TokensConfig(("square", "small_triangle"), SCALE))
+SOME = Push(TokensConfig(tuple(SEVEN), 0.6), PushConfig(count=2))
+LONGEST, FINGER = PushConfig.longest, PushConfig.finger
+
+
+def generators(count: int) -> list[np.random.Generator]:
+    return [episode_generator(1, "test", 0, 0, i) for i in range(count)]
+
+
+@pytest.fixture
+def few_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rival_module, "PUSHES", 300)
+    rival_module.tried.cache_clear()
+
+
+@pytest.mark.parametrize("task", [SQUARE, SOME], ids=["square", "two of seven"])
+def test_it_keeps_the_promises_of_a_task(task: Push, few_tried: None) -> None:
+    check_task(task)
+
+
+def test_in_place_is_within_the_tolerances_and_up_to_symmetry() -> None:
+    layout = SQUARE.layout
+    goal = layout.corners(np.zeros((1, 1, 3)))
+    for pose, expected in (
+        ((0.029, 0, 0), True),
+        ((0.031, 0, 0), False),
+        ((0.02, 0.02, 0.09 + np.pi / 2), True),
+        ((0, 0, 0.11), False),
+        ((0, 0, np.pi / 4), False),
+    ):
+        corners = layout.corners(np.array([[pose]], np.float64)).astype(np.float32)
+        assert SQUARE.placed(corners, goal).tolist() == [[expected]]
+        assert SQUARE.rewards(corners, goal).tolist() == [float(expected) - 1.0]
+        assert SQUARE.ended(corners, goal, np.zeros(1, bool)).tolist() == [expected]
+
+
+def test_a_token_that_is_away_does_not_count() -> None:
+    layout = TWO.layout
+    goal = layout.corners(np.zeros((2, 2, 3)))
+    goal[:, layout.corners_of(1)] = AWAY
+    corners = goal.copy()
+    corners[1, layout.corners_of(0)] += 0.5
+    assert TWO.rewards(corners, goal).tolist() == [0.0, -1.0]
+    goal[:, layout.corners_of(1)], corners[:, layout.corners_of(1)] = 0.0, 0.0
+    assert TWO.rewards(corners, goal).tolist() == [0.0, -0.5]
+
+
+def scene(*poses: tuple[float, float, float]) -> np.ndarray:
+    corners: np.ndarray = TWO.layout.corners(np.array(poses, np.float64))
+    return corners
+
+
+# Shares of the square's perimeter, and a short push from the middle of its first side.
+SIDES = -0.75, -0.25, 0.25, 0.75  # the middle of each
+UP = (-1, SIDES[0], 0, 0)
+
+
+def test_a_push_goes_inwards_from_where_it_begins() -> None:
+    push = push_of(TWO.layout, scene((0, 0, 0), (0.6, 0.6, 0)), UP, FINGER, LONGEST)
+    assert push.refused == ""
+    side = np.abs(TWO.layout.corners(np.zeros((2, 3)))[:4]).max()
+    assert np.abs(push.begin).max() == pytest.approx(side + FINGER + 0.005)
+    assert np.dot(push.begin, push.way) == pytest.approx(
+        -np.linalg.norm(push.begin) * np.linalg.norm(push.way)
+    )
+    far = push_of(TWO.layout, scene((0, 0, 0), (0.6, 0.6, 0)), (-1, -0.75, 0, 1), FINGER, LONGEST)
+    assert np.linalg.norm(far.way) == pytest.approx(LONGEST + 0.005)
+
+
+@pytest.mark.parametrize(
+    ("poses", "why"),
+    [
+        (((0.8, 0, 0), (-0.6, 0.6, 0)), "the table ends there"),
+        (((0, 0, 0), (0.3, 0, 0)), "token 1 is in the way"),
+    ],
+)
+def test_where_the_finger_cannot_come_down_nothing_moves(poses: Any, why: str) -> None:
+    turns = [push_of(TWO.layout, scene(*poses), (-1, s, 0, 0), FINGER, LONGEST) for s in SIDES]
+    assert [one.refused for one in turns].count(why) == 1
+    with closing(TWO.make(1)) as env:
+        env.reset(generators(1))
+        env.corners[0] = scene(*poses)
+        number = [one.refused for one in turns].index(why)
+        before = env.corners.copy()
+        env.step(np.array([[-1, SIDES[number], 0, 0]], np.float32))
+        np.testing.assert_array_equal(env.corners, before)
+        assert env.refused == [why]
+        assert env.facts()["refused"].tolist() == [True]
+
+
+def test_a_token_that_is_not_there_is_not_pushed() -> None:
+    corners = scene((0, 0, 0), (0.6, 0.6, 0))
+    corners[TWO.layout.corners_of(1)] = AWAY
+    push = push_of(TWO.layout, corners, (1, 0, 0, 0), FINGER, LONGEST)
+    assert push.refused == "token 1 is not on the table"
+
+
+def test_the_finger_stops_where_the_table_ends() -> None:
+    push = push_of(TWO.layout, scene((0.75, 0, 0), (-0.6, 0, 0)), (-1, -0.25, 1, 1), FINGER, LONGEST)
+    other = [
+        push_of(TWO.layout, scene((0.75, 0, 0), (-0.6, 0, 0)), (-1, s, 0, 1), FINGER, LONGEST)
+        for s in SIDES
+    ]
+    for one in (push, *other):
+        assert (np.abs(one.begin + one.way) <= 1 - FINGER + 1e-12).all()
+    assert min(np.linalg.norm(one.way) for one in other if not one.refused) < LONGEST - 0.02
+
+
+def pushed(way: tuple[float, float], aside: float = 0.0, **unknown: Any) -> np.ndarray:
+    """Where a square at the origin comes to that is pushed from the left."""
+    given = {"table": np.ones(1), "spread": np.ones(1), "finger": 0.3, "centres": np.zeros((1, 2))}
+    with closing(PushTable(SQUARE.layout, FINGER)) as table:
+        table.place(np.zeros((1, 3)), np.ones(1, bool), Unknowns(**(given | unknown)))
+        table.push(np.array([-0.2 - FINGER, aside]), np.array(way))
+        return table.poses()[0]
+
+
+def test_a_push_through_the_middle_takes_a_token_along() -> None:
+    np.testing.assert_allclose(pushed((0.3, 0.0)), [0.3, 0.0, 0.0], atol=0.01)
+    assert pushed((0.3, 0.0), aside=0.15)[2] < -0.2  # above the middle it turns to the right
+    assert pushed((0.3, 0.0), centres=np.array([[0.0, -0.08]]))[2] < -0.1
+    level = pushed((0.2, 0.2), finger=0.0)
+    assert pushed((0.2, 0.2), finger=0.6)[1] > level[1] + 0.02  # a rough finger drags it along
+
+
+def test_smaller_steps_come_to_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = pushed((0.3, 0.05), aside=0.1)
+    monkeypatch.setattr(table_module, "_STEP", table_module._STEP / 10)
+    np.testing.assert_allclose(pushed((0.3, 0.05), aside=0.1), usual, atol=0.02)
+
+
+def test_what_is_unknown_is_drawn_for_each_episode_or_fixed() -> None:
+    with closing(SQUARE.make(2)) as env:
+        env.reset(generators(2))
+        drawn = env.unknowns
+        assert drawn[0].finger != drawn[1].finger
+        low, high = PushConfig.finger_friction
+        assert all(low <= one.finger <= high for one in drawn)
+        assert all(np.linalg.norm(one.centres) > 0 for one in drawn)
+    fixed = replace(SQUARE, config=PushConfig(friction="fixed"))
+    with closing(fixed.make(2)) as env:
+        env.reset(generators(2))
+        assert [one.finger for one in env.unknowns] == pytest.approx([0.35, 0.35])
+
+
+@pytest.mark.parametrize("name", ["table", "planner"])
+def test_who_learned_nothing_pushes_a_square_into_place(name: str, few_tried: None) -> None:
+    with closing(SQUARE.make(6)) as env:
+        rival = SQUARE.rivals()[name](env)
+        played = play(SQUARE, env, generators(6), rival)
+    scores = SQUARE.score(played)
+    assert scores["solved"] >= 0.5
+    assert scores["pushes"] < 8
+    assert scores["coverage"] > 0.7
+
+
+def test_one_of_two_tokens_is_rewarded() -> None:
+    """And the second one is left alone by who is done with it."""
+
+    def choose(seen: Arrays, past: History, rng: Any) -> np.ndarray:
+        return np.zeros((1, 4), np.float32)
+
+    with closing(TWO.make(1)) as env:
+        played = play(TWO, env, generators(1), choose)
+    assert set(np.round(played.episodes.rewards.ravel(), 6)) <= {-1.0, -0.5, 0.0}
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"count": 2}, "task.count=2 of 1 tokens: set it to at most 1, or take a larger set"),
+        ({"spread": (2.0, 1.0)}, "task.spread must be a range, got .2.0, 1.0.: write it as"),
+        ({"finger_friction": (0.1,)}, "task.finger_friction must be a range"),
+        ({"within": 0.0}, "task.within must be between"),
+        ({"friction": "told"}, "task.friction must be one of drawn, fixed, got 'told'"),
+    ],
+)
+def test_wrong_settings_are_refused(settings: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        replace(SQUARE, config=PushConfig(**settings))
