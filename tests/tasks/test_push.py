@@ -122,14 +122,11 @@ def test_a_token_that_is_not_there_is_not_pushed() -> None:
 
 
 def test_the_finger_stops_where_the_table_ends() -> None:
-    push = push_of(TWO.layout, scene((0.75, 0, 0), (-0.6, 0, 0)), (-1, -0.25, 1, 1), FINGER, LONGEST)
-    other = [
-        push_of(TWO.layout, scene((0.75, 0, 0), (-0.6, 0, 0)), (-1, s, 0, 1), FINGER, LONGEST)
-        for s in SIDES
-    ]
-    for one in (push, *other):
-        assert (np.abs(one.begin + one.way) <= 1 - FINGER + 1e-12).all()
-    assert min(np.linalg.norm(one.way) for one in other if not one.refused) < LONGEST - 0.02
+    corners, aimed = scene((0.75, 0, 0), (-0.6, 0, 0)), ((s, t) for s in SIDES for t in (-1, 0, 1))
+    made = [push_of(TWO.layout, corners, (-1, s, t, 1), FINGER, LONGEST) for s, t in aimed]
+    went = [one for one in made if not one.refused]
+    assert all((np.abs(one.begin + one.way) <= 1 - FINGER + 1e-12).all() for one in went)
+    assert min(np.linalg.norm(one.way) for one in went) < LONGEST - 0.02
 
 
 def pushed(way: tuple[float, float], aside: float = 0.0, **unknown: Any) -> np.ndarray:
