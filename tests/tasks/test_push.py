@@ -1,11 +1,14 @@
 """Tokens that a finger pushes: what a push is, where they come, and who learned nothing."""
 
+import warnings
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 import tangram_tasks.push.table as table_module
 import tangram_tasks.push.table_rival as rival_module
@@ -15,6 +18,7 @@ from tangram_core.seeding import episode_generator
 from tangram_core.spec import Arrays
 from tangram_core.task import History
 from tangram_sim.geometry.layout import TokensConfig
+from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
 from tangram_tasks.push.places import AWAY, push_of
 from tangram_tasks.push.table import PushTable, Unknowns
 from tangram_tasks.push.task import Push, PushConfig
@@ -201,3 +205,32 @@ def test_one_of_two_tokens_is_rewarded() -> None:
 def test_wrong_settings_are_refused(settings: dict[str, Any], reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         replace(SQUARE, config=PushConfig(**settings))
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_gymnasium_checks_it_without_a_warning(name: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(name, render_mode="rgb_array", render_size=60)
+        check_env(env.unwrapped)
+        env.reset(seed=0)
+        *_, truncated, info = [env.step(env.action_space.sample()) for _ in range(8)][-1]
+    assert truncated == (name == "Push-v0")
+    assert info["is_success"] in (True, False)
+    env.close()
+
+
+def test_compute_reward_is_that_of_the_step() -> None:
+    with closing(PushGoalEnv(PAIR)) as env:
+        seen, _ = env.reset(seed=3)
+        rows = []
+        for _ in range(6):
+            seen, reward, terminated, _, info = env.step(env.action_space.sample())
+            goals = seen["achieved_goal"], seen["desired_goal"]
+            assert env.compute_reward(*goals, info) == pytest.approx(reward)
+            assert env.compute_terminated(*goals, info) == terminated == info["is_success"]
+            rows.append((*goals, reward))
+        achieved, desired, rewards = map(np.array, zip(*rows, strict=True))
+        np.testing.assert_allclose(env.compute_reward(achieved, desired, {}), rewards)
+        own = env.compute_reward(achieved, achieved, {})
+        assert own.tolist() == [0.0] * 6
