@@ -1,4 +1,5 @@
 """A finger pushes tokens into place on a table whose friction nobody is told.
 
-`task.py` says what is played and what it is worth, `table.py` is the engine, `env.py` plays.
+`task.py` says what is played and what it is worth, `places.py` what a push is, `env.py` plays, and
+the others learned nothing. The engine is `tangram_sim.world.pushing`.
 """

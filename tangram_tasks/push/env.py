@@ -10,8 +10,8 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Env, Generators, Step
+from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.places import AWAY, begin, push_of
-from tangram_tasks.push.table import PushTable, Unknowns
 
 if TYPE_CHECKING:
     from tangram_tasks.push.task import Push

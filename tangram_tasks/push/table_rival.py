@@ -19,8 +19,8 @@ from tangram_core.task import Generators, History
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines_at, shared_area
 from tangram_sim.geometry.shapes import Shape
+from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.places import on_table, push_of
-from tangram_tasks.push.table import PushTable, Unknowns
 
 if TYPE_CHECKING:
     from tangram_tasks.push.env import PushEnv

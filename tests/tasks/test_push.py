@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import tangram_tasks.push.table as table_module
+import tangram_sim.world.pushing as table_module
 import tangram_tasks.push.table_rival as rival_module
 from tangram_core.conformance import check_task, play
 from tangram_core.errors import ConfigError
@@ -18,9 +18,9 @@ from tangram_core.seeding import episode_generator
 from tangram_core.spec import Arrays
 from tangram_core.task import History
 from tangram_sim.geometry.layout import TokensConfig
+from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
 from tangram_tasks.push.places import AWAY, push_of
-from tangram_tasks.push.table import PushTable, Unknowns
 from tangram_tasks.push.task import Push, PushConfig
 from tests.sim.builders import SEVEN
 
