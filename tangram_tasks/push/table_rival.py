@@ -31,6 +31,7 @@ FIRST, SECOND = 120, 1000  # that are followed in thought, half the best, half a
 CLEAR = 0.02  # share of a token that may come to lie on another: it is pushed aside a little
 WAY_POINTS = 4  # of a token's way that are looked at
 BLOCKED = 1e3  # cost of a push that is not clear
+CHECKED = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,12 @@ def tried(shape: Shape, finger: float, longest: float, friction: float, spread: 
     return Pushes(actions, moved, begins, ends)
 
 
+def _error(pose: Floats, desired: Floats) -> Floats:
+    """(3,) the way from a pose to another, in its own frame."""
+    way = (desired[:2] - pose[:2]) @ (1.0, 1j) * np.exp(-1j * pose[2])
+    return np.array([way.real, way.imag, desired[2] - pose[2]])
+
+
 def after(errors: Floats, moved: Floats) -> Floats:
     """(..., 3) ways that are left, in the frames of tokens that moved by (..., 3) in theirs."""
     left = (errors[..., :2] - moved[..., :2]) @ (1.0, 1j) * np.exp(-1j * moved[..., 2])
@@ -77,8 +84,17 @@ def after(errors: Floats, moved: Floats) -> Floats:
 class Lookup:
     """Chooses by what was tried of each shape alone."""
 
-    def __init__(self, task: "Push", env: "PushEnv") -> None:
+    def __init__(self, task: "Push", env: "PushEnv", checked: int = CHECKED) -> None:
+        """Try pushes of each shape.
+
+        Args:
+            task: what is played.
+            env: where.
+            checked: pushes that are tried in an engine, where others lie, before one is played.
+        """
         middle, config = env.middle, task.config
+        self._env, self._checked = env, checked
+        self._table = PushTable(task.layout, config.finger)
         self._task, self._layout = task, task.layout
         self._tried = [
             tried(one, config.finger, config.longest, middle.finger, float(middle.spread[0]))
@@ -94,25 +110,47 @@ class Lookup:
     def _best(self, corners: Floats, goals: Floats, rng: np.random.Generator) -> Floats:
         task, layout = self._task, self._layout
         corners, goals = np.asarray(corners, np.float64), np.asarray(goals, np.float64)
-        present, poses, desired = (
-            on_table(goals, layout),
-            layout.poses(corners),
-            layout.poses(goals),
-        )
+        poses, desired = layout.poses(corners), layout.poses(goals)
+        present = on_table(goals, layout)
         placed = task.placed(corners[None], goals[None])[0]
-        best, least = np.zeros(4), np.inf
-        for token in np.flatnonzero(present & ~placed).tolist():
-            way = (desired[token, :2] - poses[token, :2]) @ (1.0, 1j)
-            way = way * np.exp(-1j * poses[token, 2])
-            error = np.array([way.real, way.imag, desired[token, 2] - poses[token, 2]])
+        left = np.flatnonzero(present & ~placed).tolist()
+        found: list[tuple[float, Floats]] = []
+        for token in left:
+            error = _error(poses[token], desired[token])
             chosen, costs = self._ranked(token, error, rng)
             clear = self._clear(token, chosen, poses, present)
             costs = np.where(clear, costs, costs + BLOCKED) - self._cost(token, error[None])[0]
-            i = int(costs.argmin())
-            if costs[i] < least:
-                named = (token + 0.5) / layout.tokens * 2.0 - 1.0
-                best, least = np.array([named, *self._tried[token].actions[chosen[i]]]), costs[i]
-        return best
+            named = (token + 0.5) / layout.tokens * 2.0 - 1.0
+            for i in np.argsort(costs)[: max(1, self._checked // len(left))].tolist():
+                action = np.append(named, self._tried[token].actions[chosen[i]])
+                found.append((float(costs[i]), action))
+        if not found:
+            return np.zeros(4)
+        if len(found) > 1 and self._checked > 1:
+            self._table.place(poses, present, self._env.middle)
+            found = [(self._after(one, poses, corners, desired, present), one) for _, one in found]
+        return min(found, key=lambda one: one[0])[1]
+
+    def _after(
+        self, action: Floats, poses: Floats, corners: Floats, desired: Floats, present: Bools
+    ) -> float:
+        """What is left of all tokens after a push, tried in the engine: the least pushes first."""
+        config = self._task.config
+        push = push_of(self._layout, corners, action, config.finger, config.longest)
+        if push.refused:
+            return BLOCKED
+        self._table.lay(poses)
+        self._table.push(push.begin, push.way)
+        now, whole = self._table.poses(), 0.0
+        for token in np.flatnonzero(present).tolist():
+            error = _error(now[token], desired[token])
+            cost = float(self._cost(token, error[None])[0])
+            if cost > 1.0:
+                after_one = self._cost(token, after(error, self._tried[token].moved)).min()
+                whole += 2.0 + float(after_one)
+            else:
+                whole += 0.2 * cost
+        return whole
 
     def _ranked(self, token: int, error: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
         """Pushes (n,), and what is left after them and the best that may follow."""
