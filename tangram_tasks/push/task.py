@@ -94,7 +94,6 @@ class Push(Task):
         Score("coverage", "covered"),
         Score("pushes", "pushes", digits=1),
         Score("refused", "pushes refused", digits=2),
-        Score("decision_ms", "a decision", digits=1, unit=" ms"),
     )
     tokens: TokensConfig
     config: PushConfig = PushConfig()
@@ -186,7 +185,6 @@ class Push(Task):
             "coverage": float((overlap_area(ends, goals, self.layout) / areas).mean()),
             "pushes": float(last.mean()),
             "refused": float(refused.sum(axis=1).mean()),
-            "decision_ms": float(1e3 * played.slowest.mean()) if len(played.slowest) else 0.0,
         }
 
     def draw(self, played: Played) -> Pixels:
