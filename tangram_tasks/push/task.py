@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_core.arrays import Bools, Floats, Ints, Pixels
 from tangram_core.errors import ConfigError
 from tangram_core.scores import Score
 from tangram_core.settings import NETWORK, Settings, setting
@@ -169,16 +169,12 @@ class Push(Task):
         """Of the moment at which all were in place first, or of the end."""
         from tangram_sim.geometry.overlap import overlap_area  # noqa: PLC0415
 
-        terminated = played.episodes.terminated.astype(bool)
-        count, horizon = terminated.shape
-        solved = terminated.any(axis=1)
-        last = np.where(solved, terminated.argmax(axis=1) + 1, horizon)
-        rows = np.arange(count)
-        ends, goals = played.facts["corners"][rows, last], played.facts["goals"][:, 0]
+        solved, last, ends = _ends(played)
+        goals = played.facts["goals"][:, 0]
         present = on_table(goals, self.layout)
         areas = (present * self.layout.areas).sum(axis=1)
-        counts = np.arange(1, horizon + 1) <= last[:, None]
-        refused = played.facts["refused"][:, 1:].astype(bool) & counts
+        refused = played.facts["refused"][:, 1:].astype(bool)
+        refused &= np.arange(refused.shape[1]) < last[:, None]
         return {
             "solved": float(solved.mean()),
             "placed": float(1.0 + self.paid(self.placed(ends, goals), present).mean()),
@@ -191,8 +187,9 @@ class Push(Task):
         """How the first episodes end."""
         from tangram_sim.drawing.scenes import episode_sheet  # noqa: PLC0415
 
-        corners, goals = played.facts["corners"][:PICTURES], played.facts["goals"][:PICTURES, 0]
-        sheet = episode_sheet(self.layout, ARENA, corners[:, 0], corners[:, -1], goals, 4, PIXELS)
+        starts, goals = (played.facts[name][:PICTURES, 0] for name in ("corners", "goals"))
+        ends = _ends(played)[2][:PICTURES]
+        sheet = episode_sheet(self.layout, ARENA, starts, ends, goals, 4, PIXELS)
         return np.asarray(sheet.convert("RGB"))
 
     def identity(self) -> Json:
@@ -202,3 +199,11 @@ class Push(Task):
     def facts(self) -> Json:
         """How many tokens there are."""
         return {"task": f"push of {self.count}"}
+
+
+def _ends(played: Played) -> tuple[Bools, Ints, Floats]:
+    """(E,) whether all came into place, (E,) after how many pushes, and corners (E, V, 2) then."""
+    terminated = played.episodes.terminated.astype(bool)
+    solved = np.asarray(terminated.any(axis=1))
+    last = np.where(solved, terminated.argmax(axis=1) + 1, terminated.shape[1])
+    return solved, last, played.facts["corners"][np.arange(len(last)), last]
