@@ -101,7 +101,7 @@ class PushTable:
             self._put(token, poses[token])
 
     def push(self, begin: Floats, way: Floats) -> None:
-        """Bring the finger down at `begin` (2,), move it by `way` (2,), and lift it."""
+        """Bring the finger down at `begin` (2,), move it by `way` (2,), not none, and lift it."""
         length = math.hypot(*way)
         self._finger_at(begin[0], begin[1], 0.0)
         self._call(  # a unit in a second

@@ -80,6 +80,8 @@ def push_of(
     way = length * np.array([direction.real, direction.imag])
     room = edge - np.sign(way) * begin  # in each direction, to where the finger would leave
     way = way * min(1.0, *(room / np.maximum(np.abs(way), 1e-9)).tolist())
+    if np.linalg.norm(way) < LEAST:
+        return Push(begin, np.zeros(2), "the table ends there")
     clear = _distances(layout, corners, begin)
     clear[token] = np.inf
     if clear.min() < finger:
