@@ -84,18 +84,20 @@ def episode_sheet(
     goals: Floats | Singles,
     columns: int = 4,
     size: int = 240,
+    shares: Floats | None = None,
 ) -> Image.Image:
     """One picture for each of E episodes with its overlap below, and one legend for all of them.
 
     `starts`, `ends` and `goals` are corners (E, V, 2) of tokens and targets; `size` is the side of
-    one picture in pixels.
+    one picture in pixels. `shares` (E,) stand for the overlap where not all tokens are there.
     """
     starts, ends, goals = (np.asarray(part, np.float64) for part in (starts, ends, goals))
     scenes = [
         draw_scene(layout, arena, end, goal, size, start=start)
         for start, end, goal in zip(starts, ends, goals, strict=True)
     ]
-    captions = [f"overlap  {share:.3f}" for share in overlap_share(ends, goals, layout)]
+    covered = overlap_share(ends, goals, layout) if shares is None else shares
+    captions = [f"overlap  {share:.3f}" for share in covered]
     sheet = contact_sheet(scenes, columns, captions)
     return with_legend(sheet, max(size // 18, SMALLEST_TEXT))
 

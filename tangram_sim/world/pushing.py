@@ -103,6 +103,9 @@ class PushTable:
     def push(self, begin: Floats, way: Floats) -> None:
         """Bring the finger down at `begin` (2,), move it by `way` (2,), not none, and lift it."""
         length = math.hypot(*way)
+        steps = max(1, math.ceil(length / _STEP))
+        # First: what a motor can do hangs on the step's length.
+        self._call("setPhysicsEngineParameter", fixedTimeStep=length, numSubSteps=steps)
         self._finger_at(begin[0], begin[1], 0.0)
         self._call(  # a unit in a second
             "setJointMotorControlArray",
@@ -112,8 +115,6 @@ class PushTable:
             targetVelocities=(way[0] / length, way[1] / length, 0.0),
             forces=(_FORCE, _FORCE, _FORCE),
         )
-        steps = max(1, math.ceil(length / _STEP))
-        self._call("setPhysicsEngineParameter", fixedTimeStep=length, numSubSteps=steps)
         self._call("stepSimulation")
         self._finger_at(begin[0], begin[1], _ABOVE)
         for token in self._bodies:

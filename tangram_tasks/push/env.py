@@ -60,7 +60,9 @@ class PushEnv(Env):
             if not push.refused:
                 self.tables[b].push(push.begin, push.way)
                 self.corners[b] = self.corners_of(self.tables[b].poses(), self._present[b])
-        placed = self._task.placed(self.corners, self.goals)
+        # As the master has them, which comes to the same reward.
+        corners, goals = self.corners.astype(np.float32), self.goals.astype(np.float32)
+        placed = self._task.placed(corners, goals)
         rewards = self._task.paid(placed, self._present)
         return Step(self._seen(), rewards, np.asarray(placed.all(axis=1)))
 

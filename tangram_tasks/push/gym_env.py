@@ -11,11 +11,15 @@ import numpy as np
 from gymnasium import spaces
 
 from tangram_core.arrays import Floats, Pixels, Singles
+from tangram_core.errors import ConfigError
+from tangram_core.settings import check_range
+from tangram_core.setup import from_mapping
 from tangram_core.spec import Array
 from tangram_sim.drawing.scenes import draw_scene
+from tangram_sim.env import check_render_mode
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.puzzles.assembly import COUNTS
-from tangram_sim.table import Observation
+from tangram_sim.table import MAX_SIDE, Observation
 from tangram_tasks.push.env import PushEnv
 from tangram_tasks.push.places import ARENA
 from tangram_tasks.push.task import FURTHEST, PER_TOKEN, Push, PushConfig
@@ -32,7 +36,7 @@ IDS: dict[str, tuple[tuple[str, ...], float]] = {
 class PushGoalEnv(gymnasium.Env[Observation, Singles]):
     """One table. Observations are corners (2V,), as is what is achieved; goals are their places.
 
-    An episode terminates when all tokens are in place; eight pushes a token are its limit. `info`
+    An episode terminates when all tokens are in place; an id has eight pushes a token. `info`
     has `is_success`, and `refused` with the reason where the finger could not come down.
     """
 
@@ -44,6 +48,7 @@ class PushGoalEnv(gymnasium.Env[Observation, Singles]):
         scale: float = SCALE,
         render_mode: str | None = None,
         render_size: int = 240,
+        horizon: int | None = None,
         **settings: Any,
     ) -> None:
         """Set up the table.
@@ -53,12 +58,24 @@ class PushGoalEnv(gymnasium.Env[Observation, Singles]):
             scale: side of the full square that they are cut from, arena units.
             render_mode: None or rgb_array.
             render_size: side of a picture, pixels.
+            horizon: pushes of an episode. An id has it, as its time limit does not change with
+                other settings: those that would make longer or shorter episodes are refused.
             **settings: the fields of `PushConfig`.
 
         Raises:
             ConfigError: a setting that cannot work.
         """
-        self.task = Push(TokensConfig(tuple(shapes), scale), PushConfig(**settings))
+        check_render_mode(render_mode)
+        check_range("render_size", render_size, 1, MAX_SIDE)
+        config = from_mapping(PushConfig, settings)
+        self.task = Push(TokensConfig(tuple(shapes), scale), config)
+        self.task.check(plays=True)
+        pushes = self.task.spec.horizon
+        if horizon not in (None, pushes):
+            raise ConfigError(
+                f"an episode of these settings has {pushes} pushes, and the id's time limit is "
+                f"{horizon}: give horizon={pushes} and max_episode_steps={pushes}, too"
+            )
         self.render_mode, self._size = render_mode, render_size
         self._env = PushEnv(self.task, 1)
         self.action_space = spaces.Box(-1.0, 1.0, (self.task.spec.action_size,), np.float32)
@@ -75,8 +92,8 @@ class PushGoalEnv(gymnasium.Env[Observation, Singles]):
         return self._seen(), {}
 
     def step(self, action: Singles) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Push once, by an action (4,)."""
-        step = self._env.step(np.asarray(action, np.float32)[None])
+        """Push once, by an action (4,), cut to [-1, 1]."""
+        step = self._env.step(np.clip(np.asarray(action, np.float32), -1.0, 1.0)[None])
         ended = bool(step.terminated[0])
         info: dict[str, Any] = {"is_success": ended}
         if self._env.refused[0]:
@@ -126,5 +143,5 @@ for _name, (_shapes, _scale) in IDS.items():
             _name,
             PushGoalEnv,
             max_episode_steps=PER_TOKEN * len(_shapes),
-            kwargs={"shapes": _shapes, "scale": _scale},
+            kwargs={"shapes": _shapes, "scale": _scale, "horizon": PER_TOKEN * len(_shapes)},
         )

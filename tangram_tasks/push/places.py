@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from tangram_core.arrays import AnyArray, Bools, Floats, Ints
+from tangram_core.errors import SamplingError
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.sampling import sample_batch
@@ -127,8 +128,16 @@ def begin(layout: Layout, count: int, rng: np.random.Generator) -> tuple[Ints, F
     own = _part(layout, tuple(tokens.tolist()))
     kind = "touching" if has_all_tans(own) else "connected" if count > 1 else "uniform"
     sim = SimConfig(arena=ARENA, targets=kind)
-    goals, _ = sample_targets(own, sim, [rng])
-    starts = sample_batch(own, sim, [rng])
+    try:
+        goals, flipped = sample_targets(own, sim, [rng])
+        while flipped.any():  # a figure of which a token lies on its other side: no push turns it
+            goals, flipped = sample_targets(own, sim, [rng])
+        starts = sample_batch(own, sim, [rng])
+    except SamplingError:
+        raise SamplingError(
+            f"no room for {', '.join(shape.name for shape in own.shapes)} on a table of width "
+            f"{ARENA:g}: lower tokens.scale"
+        ) from None
     return tokens, starts[0], goals[0]
 
 

@@ -6,6 +6,7 @@ Legend: E episodes, T pushes of an episode, K tokens, V corners, n rows.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
@@ -17,7 +18,7 @@ from tangram_core.settings import NETWORK, Settings, setting
 from tangram_core.spec import Array, EpisodeSpec, Field
 from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
-from tangram_tasks.push.places import ARENA, errors, on_table
+from tangram_tasks.push.places import ARENA, begin, errors, on_table
 
 if TYPE_CHECKING:
     from tangram_tasks.push.env import PushEnv
@@ -148,6 +149,12 @@ class Push(Task):
         """(n,) whether all are in place."""
         return np.asarray(self.placed(achieved, desired).all(axis=1))
 
+    def check(self, *, plays: bool) -> None:
+        """Refuse tokens that have no room, and to play where there is no engine."""
+        begin(self.layout, self.count, np.random.default_rng(0))
+        if plays and find_spec("pybullet") is None:
+            raise ConfigError("task=push needs PyBullet, which is missing: pip install pybullet")
+
     def make(self, count: int, purpose: Purpose = "play") -> Env:  # noqa: ARG002
         """So many tables in this process."""
         from tangram_tasks.push.env import PushEnv  # noqa: PLC0415
@@ -156,29 +163,26 @@ class Push(Task):
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
         """Chance, what was tried of each shape alone, and what an engine of one's own finds."""
-        from tangram_tasks.push.rivals import Planner, Search  # noqa: PLC0415
+        from tangram_tasks.push.rivals import Planner  # noqa: PLC0415
         from tangram_tasks.push.table_rival import Lookup  # noqa: PLC0415
 
         return {
             "random": super().rivals()["random"],
             "table": lambda env: Lookup(self, cast("PushEnv", env)),
-            "planner": lambda env: Planner(self, cast("PushEnv", env), Search()),
+            "planner": lambda env: Planner(self, cast("PushEnv", env)),
         }
 
     def score(self, played: Played) -> dict[str, float]:
         """Of the moment at which all were in place first, or of the end."""
-        from tangram_sim.geometry.overlap import overlap_area  # noqa: PLC0415
-
         solved, last, ends = _ends(played)
         goals = played.facts["goals"][:, 0]
         present = on_table(goals, self.layout)
-        areas = (present * self.layout.areas).sum(axis=1)
         refused = played.facts["refused"][:, 1:].astype(bool)
         refused &= np.arange(refused.shape[1]) < last[:, None]
         return {
             "solved": float(solved.mean()),
             "placed": float(1.0 + self.paid(self.placed(ends, goals), present).mean()),
-            "coverage": float((overlap_area(ends, goals, self.layout) / areas).mean()),
+            "coverage": float(self._covered(ends, goals).mean()),
             "pushes": float(last.mean()),
             "refused": float(refused.sum(axis=1).mean()),
         }
@@ -189,8 +193,17 @@ class Push(Task):
 
         starts, goals = (played.facts[name][:PICTURES, 0] for name in ("corners", "goals"))
         ends = _ends(played)[2][:PICTURES]
-        sheet = episode_sheet(self.layout, ARENA, starts, ends, goals, 4, PIXELS)
+        shares = self._covered(ends, goals)
+        sheet = episode_sheet(self.layout, ARENA, starts, ends, goals, 4, PIXELS, shares)
         return np.asarray(sheet.convert("RGB"))
+
+    def _covered(self, corners: Floats, goals: Floats) -> Floats:
+        """(n,) shares of the places that tokens with corners (n, V, 2) cover."""
+        from tangram_sim.geometry.overlap import overlap_area  # noqa: PLC0415
+
+        areas = (on_table(goals, self.layout) * self.layout.areas).sum(axis=1)
+        shares: Floats = overlap_area(corners, goals, self.layout) / areas
+        return shares
 
     def identity(self) -> Json:
         """Tokens by what makes them."""
