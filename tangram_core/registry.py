@@ -34,6 +34,7 @@ OURS: dict[Role, dict[str, str]] = {
         "pair": "tangram_agent.agents.pair.agent:Pair",
         "outline": "tangram_agent.agents.outline.agent:Outline",
         "goal": "tangram_agent.agents.goal.agent:Goal",
+        "push": "tangram_agent.agents.push.agent:Pushing",
     },
 }
 

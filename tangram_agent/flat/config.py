@@ -9,13 +9,9 @@ GOALS = ("future", "next", "final")
 
 
 @dataclass(frozen=True)
-class BaseConfig(Settings, section="agent"):
-    """Networks, pace, replay, hindsight and exploration."""
+class EpisodeConfig(Settings, section="agent"):
+    """Pace, replay of whole episodes, and hindsight."""
 
-    hidden: tuple[int, ...] = setting(
-        (256, 256), "widths of the hidden layers", low=1, high=65536, part=NETWORK
-    )
-    layer_norm: bool = setting(True, "normalise each hidden layer (Ba et al. 2016)", part=NETWORK)
     learning_rate: float = setting(
         1e-3, "Adam's, of all networks", low=1e-9, high=1e3, part=LEARNING
     )
@@ -32,9 +28,6 @@ class BaseConfig(Settings, section="agent"):
     gamma: float = setting(0.95, "discount", low=0, high=0.99999, part=LEARNING)
     polyak: float = setting(
         0.99, "share of a target network that an update keeps", low=0, high=1, part=LEARNING
-    )
-    clip_targets: bool = setting(
-        True, "keep targets within what the task's rewards can add up to", part=LEARNING
     )
     goals: tuple[str, ...] = setting(
         ("future",),
@@ -53,20 +46,37 @@ class BaseConfig(Settings, section="agent"):
         high=1,
         part=LEARNING,
     )
-    noise: float = setting(
-        0.2, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
-    )
     uniform_share: float = setting(
         0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("hidden", "goals"):
-            if not getattr(self, name):
-                raise ConfigError(f"{self.section}.{name} must name at least one, got []")
+        if not self.goals:
+            raise ConfigError(f"{self.section}.goals must name at least one, got []")
         if self.batch_size > self.replay_capacity:
             raise ConfigError(
                 f"{self.section}.batch_size ({self.batch_size}) must not exceed "
                 f"{self.section}.replay_capacity ({self.replay_capacity})"
             )
+
+
+@dataclass(frozen=True)
+class BaseConfig(EpisodeConfig, section="agent"):
+    """Networks and exploration, too."""
+
+    hidden: tuple[int, ...] = setting(
+        (256, 256), "widths of the hidden layers", low=1, high=65536, part=NETWORK
+    )
+    layer_norm: bool = setting(True, "normalise each hidden layer (Ba et al. 2016)", part=NETWORK)
+    clip_targets: bool = setting(
+        True, "keep targets within what the task's rewards can add up to", part=LEARNING
+    )
+    noise: float = setting(
+        0.2, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.hidden:
+            raise ConfigError(f"{self.section}.hidden must name at least one, got []")

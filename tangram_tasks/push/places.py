@@ -54,35 +54,13 @@ class Push:
 def push_of(
     layout: Layout, corners: Floats, action: AnyArray, finger: float, longest: float
 ) -> Push:
-    """What an action means.
-
-    Args:
-        layout: the tokens.
-        corners: (V, 2) of the tokens.
-        action: (4,) in [-1, 1]: which token, where on its edge (a share of its perimeter from its
-            first corner on), the direction against the inward normal, how far.
-        finger: its radius.
-        longest: way of the longest push, after the finger has met the token.
-    """
-    which, where, turn, far = np.asarray(action, np.float64).tolist()
-    token = min(int((which + 1.0) / 2.0 * layout.tokens), layout.tokens - 1)
-    begin, way = np.zeros(2), np.zeros(2)
+    """What an action (4,) means where tokens have corners (V, 2); see `ways_of`."""
+    tokens, begins, ways = ways_of(layout, corners[None], np.asarray(action)[None], finger, longest)
+    token, begin, way = int(tokens[0]), begins[0], ways[0]
     if not on_table(corners, layout)[token]:
         return Push(begin, way, f"token {token} is not on the table")
-    own = corners[layout.corners_of(token)] @ (1.0, 1j)
-    point, normal = _on_edge(own, (where + 1.0) / 2.0)
-    start = point - normal * (finger + GAP)
-    direction = normal * np.exp(1j * turn * STEEPEST)
-    length = GAP + LEAST + (far + 1.0) / 2.0 * (longest - LEAST)
-    edge = ARENA / 2.0 - finger
-    begin = np.array([start.real, start.imag])
-    if (np.abs(begin) > edge).any():
+    if not way.any():
         return Push(begin, way, "the table ends there")
-    way = length * np.array([direction.real, direction.imag])
-    room = edge - np.sign(way) * begin  # in each direction, to where the finger would leave
-    way = way * min(1.0, *(room / np.maximum(np.abs(way), 1e-9)).tolist())
-    if np.linalg.norm(way) < LEAST:
-        return Push(begin, np.zeros(2), "the table ends there")
     clear = _distances(layout, corners, begin)
     clear[token] = np.inf
     if clear.min() < finger:
@@ -90,16 +68,49 @@ def push_of(
     return Push(begin, way)
 
 
-def _on_edge(corners: AnyArray, share: float) -> tuple[complex, complex]:
-    """The point at a share of a polygon's perimeter, and the inward normal there."""
-    edges = np.roll(corners, -1) - corners
+def ways_of(
+    layout: Layout, corners: Floats, actions: AnyArray, finger: float, longest: float
+) -> tuple[Ints, Floats, Floats]:
+    """Which tokens (n,), where the finger comes down beside them (n, 2), and its way (n, 2).
+
+    No way where it would come down, or go, beyond the table; whether others are in the way is not
+    looked at.
+
+    Args:
+        layout: the tokens.
+        corners: (n, V, 2) of the tokens.
+        actions: (n, 4) in [-1, 1]: which token, where on its edge (a share of its perimeter from
+            its first corner on), the direction against the inward normal, how far.
+        finger: its radius.
+        longest: way of the longest push, after the finger has met the token.
+    """
+    which, where, turn, far = np.asarray(actions, np.float64).T
+    tokens = np.minimum(((which + 1.0) / 2.0 * layout.tokens).astype(np.int64), layout.tokens - 1)
+    own = corners[np.arange(len(tokens))[:, None], layout.padded_corners[tokens]] @ (1.0, 1j)
+    point, normal = _on_edge(own, (where + 1.0) / 2.0)
+    start = point - normal * (finger + GAP)
+    direction = normal * np.exp(1j * turn * STEEPEST)
+    length = GAP + LEAST + (far + 1.0) / 2.0 * (longest - LEAST)
+    begins, ways = (np.stack([z.real, z.imag], axis=1) for z in (start, length * direction))
+    edge = ARENA / 2.0 - finger
+    room = edge - np.sign(ways) * begins  # in each direction, to where the finger would leave
+    shares = (room / np.maximum(np.abs(ways), 1e-9)).min(axis=1).clip(0.0, 1.0)
+    shares[(np.abs(begins) > edge).any(axis=1) | (shares * length < LEAST)] = 0.0
+    return tokens, begins, ways * shares[:, None]
+
+
+def _on_edge(corners: AnyArray, shares: Floats) -> tuple[AnyArray, AnyArray]:
+    """Points (n,) at shares of the perimeters of polygons (n, C), and the inward normals there."""
+    edges = np.roll(corners, -1, axis=1) - corners
     lengths = np.abs(edges)
-    ends = np.cumsum(lengths)
-    far = share * ends[-1]
-    edge = min(int(np.searchsorted(ends, far, side="right")), len(edges) - 1)
-    along = edges[edge] / lengths[edge]
-    point = corners[edge] + along * (far - ends[edge] + lengths[edge])
-    return complex(point), complex(along * 1j)
+    ends = np.cumsum(lengths, axis=1)
+    far = shares * ends[:, -1]
+    # The last edge with a length: corners of small polygons repeat their last one.
+    edge = np.minimum((ends <= far[:, None]).sum(axis=1), (ends < ends[:, -1:]).sum(axis=1))
+    rows = np.arange(len(edge))
+    along = edges[rows, edge] / np.maximum(lengths[rows, edge], 1e-12)  # away it has no size
+    points = corners[rows, edge] + along * (far - ends[rows, edge] + lengths[rows, edge])
+    return points, along * 1j
 
 
 def _distances(layout: Layout, corners: Floats, point: Floats) -> Floats:

@@ -88,6 +88,7 @@ class Push(Task):
     tokens that then are in place; an episode terminates when all are.
     """
 
+    agent: ClassVar[str] = "push"
     sections: ClassVar = {"tokens": TokensConfig, "task": PushConfig}
     scores: ClassVar = (
         Score("solved", "all in place, share"),

@@ -1,0 +1,68 @@
+"""The agent of pushes: settings, without tensors."""
+
+from dataclasses import dataclass
+from typing import ClassVar, cast
+
+from tangram_agent.flat.config import EpisodeConfig
+from tangram_core.agent import Actor, Agent, Learner, Pace
+from tangram_core.errors import ConfigError
+from tangram_core.settings import LEARNING, NETWORK, setting
+from tangram_core.task import Json, Task
+from tangram_tasks.push.task import Push
+
+
+@dataclass(frozen=True)
+class PushingConfig(EpisodeConfig, section="agent"):
+    """Its critic, and how many pushes that looks at."""
+
+    width: int = setting(128, "width of all layers", low=8, high=4096, part=NETWORK)
+    looked_at: int = setting(
+        96, "pushes of each token that the critic values before one is played", low=2, high=1024
+    )
+    targets_looked_at: int = setting(
+        8, "the same in the target of an update", low=2, high=1024, part=LEARNING
+    )
+    some_share: float = setting(
+        0.3,
+        "share of the goals of hindsight that are another for some of the tokens alone",
+        low=0,
+        high=1,
+        part=LEARNING,
+    )
+
+
+@dataclass(frozen=True)
+class Pushing(Agent):
+    """Values random pushes of each token, by Q-learning with hindsight."""
+
+    sections: ClassVar = {"agent": PushingConfig}
+    config: PushingConfig = PushingConfig()
+
+    @property
+    def pace(self) -> Pace:
+        """As the settings say."""
+        return Pace(self.config.updates_per_transition, self.config.learning_starts)
+
+    def check(self, task: Task) -> None:
+        """Refuse a task without pushes."""
+        if not isinstance(task, Push):
+            kind = type(task).__name__.lower()
+            raise ConfigError(
+                f"agent=push learns task=push alone, got task={kind}: set agent={task.agent}"
+            )
+
+    def actor(self, task: Task) -> Actor:
+        """The critic, to be loaded."""
+        from tangram_agent.agents.push.actor import PushActor  # noqa: PLC0415
+
+        return PushActor(cast("Push", task), self.config)
+
+    def learner(self, task: Task, seed: int, device: str, *, compiled: bool = False) -> Learner:
+        """With the weights of a seed."""
+        from tangram_agent.agents.push.learner import PushLearner  # noqa: PLC0415
+
+        return PushLearner(cast("Push", task), self.config, seed, device, compiled=compiled)
+
+    def facts(self) -> Json:
+        """Its name."""
+        return {"agent": "push"}

@@ -1,0 +1,62 @@
+"""Which push is best, by critics, of many that are drawn.
+
+Legend: n tables, K tokens of each, P pushes that are drawn for each token, N that are looked at.
+"""
+
+import torch
+from torch import Tensor
+
+from tangram_agent.agents.push.networks import Twins
+from tangram_agent.agents.push.scenes import Scene, Tokens
+from tangram_agent.agents.push.seen import Seen, pushes, seen_by
+
+_NEVER = -1e3  # value of what cannot be done
+
+
+def best(
+    critics: Twins, moved: Tensor, tokens: Tokens, scene: Scene, drawn: Tensor, count: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The best push of each table: its value (n,), the slot of its token (n,), and which (n,).
+
+    One critic chooses, the lesser of both says what it is worth.
+
+    Args:
+        critics: who value.
+        moved: (S, 1024, 3) what pushes do to tokens alone.
+        tokens: the set.
+        scene: n tables.
+        drawn: (n * K, P) numbers of pushes.
+        count: of pushes of each token that are looked at: the half after which least is left to go
+            if it is alone, and the first that were drawn.
+    """
+    size, each = scene.poses.shape[:2]
+    rows = torch.arange(size, device=drawn.device)
+    slots = torch.arange(each, device=drawn.device).repeat(size)
+    seen = seen_by(tokens, scene.repeated(each), slots)
+    which = _looked_at(tokens, seen, moved, drawn, count)
+    own = seen.which[:, None]
+    numbers, never = pushes(
+        tokens, seen, tokens.begins[own, which], tokens.ends[own, which], moved[own, which]
+    )
+    never = never | ~scene.present.flatten()[:, None]
+    first, second = critics.each
+    values = torch.where(never, _NEVER, first(seen, numbers)).view(size, -1)
+    value, at = values.max(1)
+    slot, push = at // count, at % count
+    row = rows * each + slot
+    other = second(_only(seen, row), numbers[row, push][:, None])[:, 0]
+    return torch.minimum(value, other), slot, which[row, push]
+
+
+def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: int) -> Tensor:
+    """(n, N) of the pushes (n, P) that are drawn."""
+    own = seen.which[:, None]
+    left = tokens.after(seen.left[:, None], moved[own, drawn], own)
+    far = left[..., :2].square().sum(-1) / tokens.within**2
+    cost = far + (left[..., 2] / tokens.turned).square()
+    half = cost.topk(count // 2, dim=1, largest=False).indices
+    return torch.cat([drawn.gather(1, half), drawn[:, : count - count // 2]], dim=1)
+
+
+def _only(seen: Seen, rows: Tensor) -> Seen:
+    return Seen(*(one[rows] for one in vars(seen).values()))

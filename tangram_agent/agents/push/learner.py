@@ -1,0 +1,210 @@
+"""Learning in the master: Q-learning over the pushes that are looked at, with hindsight.
+
+Legend: B transitions, K tokens, V corners, P pushes drawn for each token.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from tangram_agent.agents.push.actor import Played
+from tangram_agent.agents.push.agent import PushingConfig
+from tangram_agent.agents.push.choosing import best
+from tangram_agent.agents.push.networks import Alone, Twins
+from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, rotated
+from tangram_agent.agents.push.seen import pushes, seen_by
+from tangram_agent.base.learning import Loss, NetworkLearner, Rates
+from tangram_agent.flat.replay import EpisodeReplay
+from tangram_agent.nets.weights import to_arrays
+from tangram_core.agent import Streams, Tensors
+from tangram_core.spec import Array, Arrays, Episodes
+from tangram_tasks.push.places import ways_of
+from tangram_tasks.push.task import Push
+
+_DRAWN = 96  # P: pushes of which those are taken that a target looks at
+_RENEWED = 20  # updates after which the table of pushes is
+_STILL = 1e-4  # way of a token that did not move
+_TURN = 0.2  # length that a turn by one radian counts as
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What the losses see.
+
+    Attributes:
+        poses, following, goals: (B, K, 3) where tokens were, came to, and should come.
+        which, present: (B, K) see `Scene`.
+        slots: (B,) of the token that was pushed.
+        begins, ends: (B, 2) of the finger, on the table.
+        drawn: (B * K, P) pushes that may be the best that follows.
+    """
+
+    poses: Tensor
+    following: Tensor
+    goals: Tensor
+    which: Tensor
+    present: Tensor
+    slots: Tensor
+    begins: Tensor
+    ends: Tensor
+    drawn: Tensor
+
+    @property
+    def arrays(self) -> Arrays:
+        """All of it, by name."""
+        return {name: one.cpu().numpy() for name, one in vars(self).items()}
+
+    def at(self, poses: Tensor) -> Scene:
+        """The scene with tokens at poses."""
+        return Scene(poses, self.goals, self.which, self.present)
+
+
+class PushReplay(EpisodeReplay):
+    """Goals of hindsight are what was reached, for all tokens or for some."""
+
+    some_share = 0.0
+
+    def relabelled(self, desired: Array, reached: Array, rng: np.random.Generator) -> Array:
+        """See `EpisodeReplay.relabelled`."""
+        layout = self._task.layout  # type: ignore[attr-defined]
+        own = rng.random((len(desired), layout.tokens)) < 0.5
+        own |= (rng.random(len(desired)) >= self.some_share)[:, None]
+        mask = own[:, layout.token_of_corner, None]
+        return np.where(mask, reached, desired)
+
+
+class PushLearner(NetworkLearner):
+    """Critics, and what a push does to a token alone."""
+
+    replay: PushReplay
+
+    def __init__(
+        self, task: Push, config: PushingConfig, seed: int, device: str, *, compiled: bool = False
+    ) -> None:
+        """Networks with the weights of a seed, and an empty replay."""
+        self.config, self.polyak, self._task = config, config.polyak, task
+        place = torch.device(device)
+        self._tokens = Tokens(task, place)
+        self.replay = PushReplay(task, config.replay_capacity)
+        self.replay.some_share = config.some_share
+        self.capacity = self.replay.capacity * task.spec.horizon
+        corners = task.layout.padded_corners.shape[1]
+        with torch.random.fork_rng(devices=[]):  # what others draw from torch stays as it is
+            torch.default_generator.manual_seed(seed)
+            played, self.alone = Played(task, config.width), Alone(corners, config.width)
+        self.critic, self.table = played.critic, played.table
+        learned = {"critic": self.critic, "alone": self.alone}
+        others = {"table": self.table}
+        super().__init__(learned, ("critic",), device, compiled=compiled, others=others)
+
+    def rates(self, share: float) -> Rates:  # noqa: ARG002
+        """The same for all networks, and to the end."""
+        return Rates(self.config.learning_rate, self.config.learning_rate, 0.0)
+
+    @property
+    def kept(self) -> int:
+        """Transitions in the replay."""
+        return len(self.replay) * self._task.spec.horizon
+
+    def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
+        """Keep whole episodes: goals are relabelled when a batch is drawn."""
+        self.replay.add(episodes)
+        return episodes.transitions
+
+    def update(self, share: float, rng: Streams) -> dict[str, float]:
+        """One of all networks; now and then the table of pushes is renewed."""
+        numbers = super().update(share, rng)
+        if self.updates % _RENEWED == 0:
+            self.table.renew(self.alone, self._tokens)
+        return numbers
+
+    def drawn(self, rng: Streams) -> Batch:
+        """What the next update learns from."""
+        task, config, arrays = self._task, self.config, self.replay.arrays
+        rows, steps, desired, _ = self.replay.chosen(config, rng)
+        before, following = (arrays["corners"][rows, steps + i] for i in (0, 1))
+        actions = arrays["actions"][rows, steps]
+        finger, longest = task.config.finger, task.config.longest
+        corners = before.astype(np.float64)
+        pushed, begins, ways = ways_of(task.layout, corners, actions, finger, longest)
+        scene = self._tokens.scene(before, desired)
+        size = (config.batch_size * task.count, _DRAWN)
+        self.batch = batch = Batch(
+            scene.poses,
+            self._tokens.poses(following, scene.which),
+            scene.goals,
+            scene.which,
+            scene.present,
+            (scene.which == self.tensor(pushed, np.int64)[:, None]).int().argmax(1),
+            self.tensor(begins),
+            self.tensor(begins + ways),
+            self.tensor(rng["replay"].integers(PUSHES, size=size), np.int64),
+        )
+        return batch
+
+    def blanks(self) -> Iterator[Batch]:
+        """All at rest at the middle of the table."""
+        size, count = self.config.batch_size, self._task.count
+        poses = torch.zeros(size, count, 3, device=self.place)
+        which = torch.zeros(size, count, dtype=torch.int64, device=self.place)
+        ways = torch.zeros(size, 2, device=self.place)
+        drawn = torch.zeros(size * count, _DRAWN, dtype=torch.int64, device=self.place)
+        scene = poses, poses.clone(), poses.clone(), which, which == 0
+        push = which[:, 0].clone(), ways, ways.clone()
+        yield Batch(*scene, *push, drawn)
+
+    def losses(self, seen: Batch) -> Iterator[Loss]:
+        """What pushes do to a token alone, and what they are worth."""
+        tokens = self._tokens
+        with torch.no_grad():
+            target = self._target(seen)
+            view = seen_by(tokens, seen.at(seen.poses), seen.slots)
+            turn = -view.pose[:, 2]
+            ends = (rotated(at - view.pose[:, :2], turn) for at in (seen.begins, seen.ends))
+            begin, end = ends
+        moved = self.alone(tokens.outlines[view.which], begin, end)
+        yield self._alone(seen, moved)
+        moved = moved.detach()
+        with torch.no_grad():
+            numbers, _ = pushes(tokens, view, begin[:, None], end[:, None], moved[:, None])
+        values = torch.stack([one(view, numbers)[:, 0] for one in self.critic.each])
+        error = (values - target).square().mean(1).sum()
+        yield Loss("critic", error, {"q": values.mean()})
+
+    def _target(self, seen: Batch) -> Tensor:
+        """(B,) r + gamma (1 - d) max Q', within what rewards can add up to."""
+        tokens, config = self._tokens, self.config
+        critic: Twins = self.targets["critic"]  # type: ignore[assignment]
+        scene, count = seen.at(seen.following), config.targets_looked_at
+        value, _, _ = best(critic, self.table.moved, tokens, scene, seen.drawn, count)
+        least = -1.0 / (1.0 - config.gamma)
+        placed = tokens.placed(scene)
+        counts = scene.present.sum(1)
+        reward = (placed & scene.present).sum(1) / counts - 1.0  # as the task pays it
+        goes_on = ~(placed | ~scene.present).all(1)
+        target = reward + config.gamma * goes_on * value.clamp(least, 0.0)
+        return target.clamp(least, 0.0)
+
+    def _alone(self, seen: Batch, moved: Tensor) -> Loss:
+        """Of the pushes that moved one token, and no other."""
+        rows = torch.arange(len(moved), device=moved.device)
+        still = (seen.following - seen.poses).abs().amax(-1) < _STILL
+        pushed = torch.arange(still.shape[1], device=moved.device) == seen.slots[:, None]
+        counts = (still != pushed).all(1)
+        before, after = seen.poses[rows, seen.slots], seen.following[rows, seen.slots]
+        way = rotated(after[:, :2] - before[:, :2], -before[:, 2])
+        turn = torch.remainder(after[:, 2] - before[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+        true = torch.cat([way, turn[:, None] * _TURN], dim=1)
+        found = torch.cat([moved[:, :2], moved[:, 2:] * _TURN], dim=1)
+        size = functional.smooth_l1_loss(found, true, reduction="none", beta=0.02)
+        mean = (size.sum(1) * counts).sum() / counts.sum().clamp_min(1)
+        return Loss("alone", mean, {"alone": counts.to(moved.dtype).mean()})
+
+    def broadcast(self) -> Tensors:
+        """The critics, and the table of pushes."""
+        critic = {f"critic.{name}": value for name, value in to_arrays(self.critic).items()}
+        return {**critic, "table.moved": to_arrays(self.table)["moved"]}

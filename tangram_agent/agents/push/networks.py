@@ -1,0 +1,75 @@
+"""What a push does to a token alone, and what it is worth.
+
+Legend: n rows, F, G numbers of a token and of another one, K tokens, N pushes, W width.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.agents.push.scenes import PUSHES, Tokens
+from tangram_agent.agents.push.seen import PUSH, Seen, other_numbers, token_numbers
+from tangram_agent.nets.networks import perceptron
+
+_FAR = 0.2  # of a token that is pushed
+
+
+class Critic(nn.Module):
+    """Values of pushes: the others as a sum over them, then each push beside it."""
+
+    def __init__(self, corners: int, width: int) -> None:
+        super().__init__()
+        self.token = nn.Linear(token_numbers(corners), width)
+        self.other = nn.Sequential(
+            perceptron(other_numbers(corners), (width,), width, norm=True), *_ended(width)
+        )
+        self.others = nn.Linear(width, width)
+        self.mixed = nn.Sequential(*_ended(width), nn.Linear(width, width), *_ended(width))
+        self.scene, self.push = nn.Linear(width, width), nn.Linear(PUSH, width, bias=False)
+        self.value = nn.Sequential(*_ended(width), perceptron(width, (width,), 1, norm=True))
+
+    def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
+        """(n, N) of pushes (n, N, 18)."""
+        others = (self.other(seen.others) * seen.there[..., None]).sum(1)
+        scene = self.scene(self.mixed(self.token(seen.token) + self.others(others)))
+        value: Tensor = self.value(scene[:, None] + self.push(pushes))
+        return value.squeeze(-1)
+
+
+class Twins(nn.Module):
+    """Two critics, of which the lesser counts (Fujimoto et al. 2018)."""
+
+    def __init__(self, corners: int, width: int) -> None:
+        super().__init__()
+        self.each = nn.ModuleList(Critic(corners, width) for _ in range(2))
+
+
+class Alone(nn.Module):
+    """Where a token goes that is pushed and touches no other; frictions are averaged over."""
+
+    def __init__(self, corners: int, width: int) -> None:
+        super().__init__()
+        self.layers = perceptron(2 * corners + 4, (width, width), 3, norm=True)
+
+    def forward(self, outlines: Tensor, begins: Tensor, ends: Tensor) -> Tensor:
+        """(..., 3) in its own frame, of its outline (..., C, 2) and the finger's way (..., 2)."""
+        parts = outlines.flatten(-2) * 3.0, begins * 4.0, (ends - begins) * 4.0
+        moved: Tensor = self.layers(torch.cat(parts, dim=-1)) * _FAR
+        return moved
+
+
+class Table(nn.Module):
+    """What `Alone` says of the pushes that are always the same: looked up, not computed."""
+
+    def __init__(self, tokens: int) -> None:
+        super().__init__()
+        self.moved = nn.Parameter(torch.zeros(tokens, PUSHES, 3), requires_grad=False)
+
+    @torch.no_grad()
+    def renew(self, alone: Alone, tokens: Tokens) -> None:
+        """As the network has it now."""
+        outlines = tokens.outlines[:, None].expand(*tokens.begins.shape[:2], -1, -1)
+        self.moved.copy_(alone(outlines, tokens.begins, tokens.ends))
+
+
+def _ended(width: int) -> tuple[nn.Module, nn.Module]:
+    return nn.LayerNorm(width), nn.ReLU()

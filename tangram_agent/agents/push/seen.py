@@ -1,0 +1,143 @@
+"""What networks see of tokens and of pushes, in the frame of the token that is pushed.
+
+Legend: n rows, each with a token that may be pushed; K tokens of a row, C corners, N pushes.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tangram_agent.agents.push.scenes import (
+    Scene,
+    Tokens,
+    distance,
+    gap,
+    placed_at,
+    rotated,
+)
+from tangram_tasks.push.places import ARENA
+
+LEFT = 9  # numbers of a way that is left
+PUSH = 5 + LEFT + 4  # of a push: what moves, the table's edge, what is left, the others
+_LARGE = 3.0  # by which a token's corners come to about 1
+_NEAR = 0.1  # gaps above it are all alike
+_EDGE = 0.3  # so are distances from the table's edge
+
+
+def token_numbers(corners: int) -> int:
+    """Of the token that is pushed: its way, its outline, its distance from the table's edge."""
+    return LEFT + 2 * corners + 1
+
+
+def other_numbers(corners: int) -> int:
+    """Of another token: its way and outline, its pose and corners, and its place."""
+    return LEFT + 2 * corners + 4 + 2 * corners + 4
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Tokens, as one of them sees the others.
+
+    Attributes:
+        token: (n, F) itself.
+        others: (n, K - 1, G).
+        there: (n, K - 1) 1 where there is one.
+        pose, left: (n, 3) its pose, and its way to its place, in its own frame.
+        which: (n,) token of the set.
+        outlines: (n, K - 1, C, 2) of the others, on the table.
+    """
+
+    token: Tensor
+    others: Tensor
+    there: Tensor
+    pose: Tensor
+    left: Tensor
+    which: Tensor
+    outlines: Tensor
+
+
+def seen_by(tokens: Tokens, scene: Scene, slots: Tensor) -> Seen:
+    """What the tokens in slots (n,) see."""
+    rows, count = torch.arange(len(slots), device=slots.device), scene.poses.shape[1]
+    left = tokens.left(scene.poses, scene.goals, scene.which)
+    pose, which, own = scene.poses[rows, slots], scene.which[rows, slots], left[rows, slots]
+    token = [ways(tokens, own), tokens.outlines[which].flatten(1) * _LARGE, edge(pose[:, :2])]
+    other = (slots[:, None] + torch.arange(1, count, device=slots.device)) % count
+    at = rows[:, None], other
+    poses, goals, kinds = scene.poses[at], scene.goals[at], scene.which[at]
+    outlines = tokens.laid(poses, kinds)
+
+    def here(points: Tensor) -> Tensor:  # (n, K - 1, ..., 2) in the token's frame
+        shape = (-1, *[1] * (points.ndim - 2))
+        moved = points - pose[:, :2].view(*shape, 2)
+        return rotated(moved, -pose[:, 2].view(shape).expand(points.shape[:-1]))
+
+    def heading(angles: Tensor) -> Tensor:
+        turn = angles - pose[:, None, 2]
+        return torch.stack([torch.cos(turn), torch.sin(turn)], dim=-1)
+
+    others = [
+        ways(tokens, left[at]),
+        tokens.outlines[kinds].flatten(2) * _LARGE,
+        here(poses[..., :2]),
+        heading(poses[..., 2]),
+        here(outlines).flatten(2),
+        here(goals[..., :2]),
+        heading(goals[..., 2]),
+    ]
+    there = scene.present[at].to(pose.dtype)
+    seen = torch.cat(token, dim=-1), torch.cat(others, dim=-1), there
+    return Seen(*seen, pose, own, which, outlines)
+
+
+def ways(tokens: Tokens, left: Tensor) -> Tensor:
+    """(..., 9) of ways that are left (..., 3): as they are, near the tolerance, and how long."""
+    far, turn = left[..., :2].norm(dim=-1, keepdim=True), left[..., 2:].abs()
+    place = (left[..., :2] / (6.0 * tokens.within)).clamp(-1.5, 1.5)
+    angle = (left[..., 2:] / (6.0 * tokens.turned)).clamp(-1.5, 1.5)
+    in_place = tokens.near(left)[..., None].to(left.dtype)
+    logs = torch.log(far + 0.01) + 2.0, torch.log(turn + 0.03) + 1.0
+    return torch.cat([left, place, angle, *logs, in_place], dim=-1)
+
+
+def edge(points: Tensor) -> Tensor:
+    """(..., 1) how near the table's edge points (..., 2) are."""
+    room = ARENA / 2.0 - points.abs().amax(-1, keepdim=True)
+    return (room.clamp(0.0, _EDGE) / _EDGE - 0.5) * 2.0
+
+
+def pushes(
+    tokens: Tokens, seen: Seen, begins: Tensor, ends: Tensor, moved: Tensor
+) -> tuple[Tensor, Tensor]:
+    """What is seen of pushes (n, N, 18), and which cannot be made (n, N).
+
+    Args:
+        tokens: the set.
+        seen: who is pushed.
+        begins: (n, N, 2) where the finger comes down, in the token's frame.
+        ends: (n, N, 2) where it goes to.
+        moved: (n, N, 3) where the token would go if it were alone.
+    """
+    pose = seen.pose[:, None].expand(*moved.shape)
+    first, last = (rotated(at, pose[..., 2]) + pose[..., :2] for at in (begins, ends))
+    middle = (first + last) / 2.0
+    limit = ARENA / 2.0 - tokens.finger
+    beyond = (torch.maximum(first.abs(), last.abs()) > limit).any(-1)
+    left = tokens.after(seen.left[:, None], moved, seen.which[:, None])
+    parts = [moved * 3.0, edge(first), edge(last), ways(tokens, left)]
+    others = seen.outlines[:, None]
+    if not seen.outlines.shape[1]:
+        parts.append(torch.ones_like(moved[..., :1]).expand(*moved.shape[:2], 4))
+        return torch.cat(parts, dim=-1), beyond
+    which = seen.which[:, None].expand(moved.shape[:2])
+    near = [
+        distance(others, last[:, :, None]) - tokens.finger,
+        distance(others, middle[:, :, None]) - tokens.finger,
+        gap(tokens.laid(placed_at(pose, moved), which)[:, :, None], others),
+        gap(tokens.laid(placed_at(pose, moved / 2.0), which)[:, :, None], others),
+    ]
+    least = torch.stack([one.amin(-1) for one in near], dim=-1)
+    parts.append(least.clamp(-_NEAR, _NEAR) / _NEAR)
+    blocked = distance(others, first[:, :, None]).amin(-1) < tokens.finger
+    return torch.cat(parts, dim=-1), beyond | blocked
