@@ -1,0 +1,184 @@
+"""The agent of pushes: geometry, what networks see, what is learned from, and that it learns."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from shapely.geometry import Point, Polygon
+
+from tangram_agent.agents.push.agent import Pushing, PushingConfig
+from tangram_agent.agents.push.learner import PushLearner, PushReplay
+from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, distance, gap, rotated
+from tangram_agent.agents.push.seen import pushes, seen_by
+from tangram_core.agent import Learner
+from tangram_core.conformance import check_agent, play
+from tangram_core.errors import ConfigError
+from tangram_core.seeding import episode_generator
+from tangram_core.task import Generators, Played
+from tangram_sim.geometry.layout import TokensConfig
+from tangram_tasks.push.places import push_of
+from tangram_tasks.push.task import Push, PushConfig
+from tests.agent.builders import PAIR, setup
+from tests.sim.builders import SEVEN
+
+pytestmark = pytest.mark.fast
+
+CPU = torch.device("cpu")
+SMALL = PushingConfig(
+    width=8, batch_size=16, learning_starts=16, replay_capacity=200, looked_at=4, some_share=0.5
+)
+SQUARE = Push(TokensConfig(("square",), 1.1))
+TWO = Push(TokensConfig(("square", "small_triangle"), 1.1))
+SOME = Push(TokensConfig(tuple(SEVEN), 0.6), PushConfig(count=3))
+
+
+def generators(role: str, first: int, count: int) -> Generators:
+    return [episode_generator(0, role, 0, 0, first + i) for i in range(count)]
+
+
+def played(task: Push, learner: Learner, agent: Pushing, count: int = 6) -> Played:
+    actor = agent.actor(task)
+    actor.load(learner.broadcast())
+    with closing(task.make(count)) as env:
+        return play(task, env, generators("play", 0, count), actor.act)
+
+
+@pytest.mark.parametrize("task", [SQUARE, TWO, SOME], ids=["one", "two", "three of seven"])
+def test_it_keeps_the_promises_of_an_agent(task: Push) -> None:
+    check_agent(Pushing(SMALL), task)
+
+
+def test_it_learns_pushes_alone() -> None:
+    with pytest.raises(ConfigError, match="agent=push learns task=push alone, got task=place"):
+        Pushing().check(setup(PAIR).task)
+
+
+def test_distances_and_gaps_are_those_of_polygons() -> None:
+    tokens, rng = Tokens(SOME, CPU), np.random.default_rng(0)
+    which = torch.from_numpy(rng.integers(7, size=(2, 300)))
+    poses = torch.from_numpy(rng.uniform(-1, 1, (2, 300, 3)) * (0.4, 0.4, np.pi)).float()
+    points = torch.from_numpy(rng.uniform(-0.5, 0.5, (300, 2))).float()
+    some, others = (tokens.laid(poses[i], which[i]) for i in range(2))
+    far, between = distance(some, points), gap(some, others)
+    shapes = [[Polygon(one) for one in outlines.numpy()] for outlines in (some, others)]
+    for i, (one, other) in enumerate(zip(*shapes, strict=True)):
+        assert far[i] == pytest.approx(one.distance(Point(points[i].numpy())), abs=1e-5)
+        if one.intersects(other):
+            assert between[i] <= 1e-5
+        else:
+            assert -1e-5 <= between[i] <= one.distance(other) + 1e-5
+
+
+def scene(task: Push, count: int) -> Scene:
+    with closing(task.make(count)) as env:
+        seen = env.reset(generators("test", 0, count))
+        return Tokens(task, CPU).scene(seen["corners"], seen["goals"])
+
+
+def moved(scene: Scene, angle: float, x: float, y: float) -> Scene:
+    """The same, elsewhere on the table."""
+    turn = torch.full(scene.poses.shape[:2], angle)
+
+    def there(poses: torch.Tensor) -> torch.Tensor:
+        place = rotated(poses[..., :2], turn) + torch.tensor([x, y])
+        return torch.cat([place, poses[..., 2:] + angle], dim=-1)
+
+    return replace(scene, poses=there(scene.poses), goals=there(scene.goals))
+
+
+def test_what_is_seen_hangs_on_no_frame_but_the_tokens_own() -> None:
+    tokens, found = Tokens(TWO, CPU), scene(TWO, 5)
+    slots = torch.tensor([0, 1, 0, 1, 0])
+
+    def views(of: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+        seen = seen_by(tokens, of, slots)
+        return seen.token[:, :-1], seen.others  # but how near the edge is
+
+    for here, there in zip(views(found), views(moved(found, 2.0, 0.1, -0.2)), strict=True):
+        torch.testing.assert_close(here, there, atol=1e-4, rtol=1e-4)
+
+
+def test_a_token_that_is_not_there_is_not_seen() -> None:
+    tokens, agent = Tokens(SOME, CPU), Pushing(SMALL)
+    critic = agent.learner(SOME, 0, "cpu").critic.each[0]  # type: ignore[attr-defined]
+    found = scene(SOME, 4)
+    gone = replace(found, present=torch.tensor([[True, True, False]]).expand(4, 3))
+    poses = gone.poses.clone()
+    poses[:, 2] += 5.0
+    slots, zeros = torch.zeros(4, dtype=torch.int64), torch.zeros(4, 1, 18)
+    values = [
+        critic(seen_by(tokens, one, slots), zeros) for one in (gone, replace(gone, poses=poses))
+    ]
+    torch.testing.assert_close(values[0], values[1])
+
+
+def test_pushes_that_are_looked_at_are_those_that_the_table_makes() -> None:
+    """Where the finger comes down, and what refuses it."""
+    task, tokens = SOME, Tokens(SOME, CPU)
+    rng, count = np.random.default_rng(1), 40
+    with closing(task.make(count)) as env:
+        seen = env.reset(generators("test", 0, count))
+    corners = seen["corners"]
+    found = tokens.scene(corners, seen["goals"])
+    slots = torch.from_numpy(rng.integers(3, size=count))
+    view = seen_by(tokens, found, slots)
+    which = torch.from_numpy(rng.integers(PUSHES, size=(count, 30)))
+    own = view.which[:, None]
+    begins, ends = tokens.begins[own, which], tokens.ends[own, which]
+    never = pushes(tokens, view, begins, ends, torch.zeros(count, 30, 3))[1]
+    refused = 0
+    for row in range(count):
+        for i in range(30):
+            action = tokens.actions[int(view.which[row]), int(which[row, i])]
+            push = push_of(task.layout, corners[row], action, 0.04, task.config.longest)
+            refused += bool(push.refused)
+            if push.refused:
+                assert never[row, i]
+                continue
+            angle, place = view.pose[row, 2], view.pose[row, :2]
+            there = rotated(begins[row, i], angle) + place
+            np.testing.assert_allclose(there.numpy(), push.begin, atol=1e-4)
+            # The table cuts short what would leave it; the agent never asks for that.
+            if not never[row, i]:
+                way = rotated(ends[row, i] - begins[row, i], angle)
+                np.testing.assert_allclose(way.numpy(), push.way, atol=1e-4)
+    assert 10 < refused < 600
+
+
+def test_hindsight_takes_whole_tokens_of_what_was_reached() -> None:
+    replay, layout = PushReplay(SOME, 100), SOME.layout
+    replay.some_share = 0.5
+    shape = (200, layout.corner_count, 2)
+    desired, reached = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+    found = replay.relabelled(desired, reached, np.random.default_rng(0))
+    tokens = [found[:, layout.corners_of(k)].reshape(200, -1) for k in range(7)]
+    for token in tokens:
+        assert (token == token[:, :1]).all()
+    whole = np.stack([token[:, 0] for token in tokens], axis=1).all(axis=1)
+    assert 60 < whole.sum() < 140
+
+
+def test_targets_pay_and_end_as_the_task_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a discount of 0 and of 1 for a value of -1."""
+    loose = Push(SOME.tokens, replace(SOME.config, within=0.3, turned=1.5))
+    agent = Pushing(replace(SMALL, gamma=0.9, batch_size=100, relabel_share=0.9))
+    learner = agent.learner(loose, 0, "cpu")
+    assert isinstance(learner, PushLearner)
+    rng = {name: np.random.default_rng(i) for i, name in enumerate(learner.streams)}
+    learner.insert(played(loose, learner, agent).episodes, rng)
+    chosen = {}
+    real = learner.replay.chosen
+    monkeypatch.setattr(learner.replay, "chosen", lambda *a: chosen.setdefault("found", real(*a)))
+    monkeypatch.setattr(
+        "tangram_agent.agents.push.learner.best",
+        lambda *a: (torch.full((100,), -1.0), None, None),
+    )
+    targets = learner._target(learner.drawn(rng)).numpy()
+    rows, steps, desired, _ = chosen["found"]
+    achieved = learner.replay.arrays["corners"][rows, steps + 1]
+    ended = loose.ended(achieved, desired, np.zeros(100, bool))
+    expected = loose.rewards(achieved, desired) - 0.9 * ~ended
+    assert 5 < ended.sum() < 95
+    np.testing.assert_allclose(targets, expected, atol=1e-6)
