@@ -39,13 +39,6 @@ class EpisodeConfig(Settings, section="agent"):
     relabel_share: float = setting(
         0.8, "share of a batch whose goal is another; 0: no hindsight", low=0, high=1, part=LEARNING
     )
-    moved_share: float = setting(
-        0.5,
-        "share of a batch from episodes whose goal was not achieved at their start already",
-        low=0,
-        high=1,
-        part=LEARNING,
-    )
     uniform_share: float = setting(
         0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
     )
@@ -71,6 +64,13 @@ class BaseConfig(EpisodeConfig, section="agent"):
     layer_norm: bool = setting(True, "normalise each hidden layer (Ba et al. 2016)", part=NETWORK)
     clip_targets: bool = setting(
         True, "keep targets within what the task's rewards can add up to", part=LEARNING
+    )
+    moved_share: float = setting(
+        0.5,
+        "share of a batch from episodes whose goal was not achieved at their start already",
+        low=0,
+        high=1,
+        part=LEARNING,
     )
     noise: float = setting(
         0.2, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING

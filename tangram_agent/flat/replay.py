@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tangram_agent.base.ring import Column, Ring
-from tangram_agent.flat.config import EpisodeConfig
+from tangram_agent.flat.config import BaseConfig, EpisodeConfig
 from tangram_core.agent import Streams
 from tangram_core.arrays import Bools, Ints, Singles
 from tangram_core.spec import ACTIONS, Array, Episodes
@@ -72,17 +72,17 @@ class EpisodeReplay(Ring):
         first, last = achieved[:, 0], achieved[:, -1]
         self._moved[slots] = self._task.rewards(first, last) < self._task.rewards(last, last)
 
-    def sample(self, config: EpisodeConfig, rng: Streams) -> Transitions:
+    def sample(self, config: BaseConfig, rng: Streams) -> Transitions:
         """A batch, drawn with replacement; a share of it has another goal.
-
-        A goal that another moment achieved is one that the step might have been made for, and the
-        task says what it would have been worth (Andrychowicz et al. 2017).
 
         Raises:
             ValueError: the replay is empty.
         """
         spec, arrays, task = self._spec, self.arrays, self._task
-        rows, steps, desired, other = self.chosen(config, rng)
+        rows = self._chosen(config, rng["replay"])
+        steps = rng["replay"].integers(spec.horizon, size=config.batch_size)
+        ends = np.full(config.batch_size, spec.horizon)
+        desired, other = self.goals(config, rows, steps, ends, rng["hindsight"])
         recorded = arrays["terminated"][rows, steps].astype(bool)
         achieved = arrays[spec.achieved][rows, steps + 1]
         rewards = task.rewards(achieved, desired)
@@ -94,17 +94,20 @@ class EpisodeReplay(Ring):
             np.where(other, task.ended(achieved, desired, recorded), recorded),
         )
 
-    def chosen(self, config: EpisodeConfig, rng: Streams) -> tuple[Ints, Ints, Array, Bools]:
-        """Which episodes and steps (B,), goals (B, ...), and of these the others (B,)."""
-        spec, arrays = self._spec, self.arrays
-        rows = self._chosen(config, rng["replay"])
-        steps = rng["replay"].integers(spec.horizon, size=config.batch_size)
-        other = rng["hindsight"].random(config.batch_size) < config.relabel_share
-        moments = later(steps, spec.horizon, config.goals, rng["hindsight"])
-        desired = arrays[spec.desired][rows]
-        reached = arrays[spec.achieved][rows[other], moments[other]]
-        desired[other] = self.relabelled(desired[other], reached, rng["hindsight"])
-        return rows, steps, desired, other
+    def goals(
+        self, config: EpisodeConfig, rows: Ints, steps: Ints, ends: Ints, rng: np.random.Generator
+    ) -> tuple[Array, Bools]:
+        """Goals (B, ...) of steps (B,) of episodes that end at moments (B,), and which are others.
+
+        A goal that another moment achieved is one that the step might have been made for, and the
+        task says what it would have been worth (Andrychowicz et al. 2017).
+        """
+        other = rng.random(len(rows)) < config.relabel_share
+        moments = later(steps, ends, config.goals, rng)
+        desired = self.arrays[self._spec.desired][rows]
+        reached = self.arrays[self._spec.achieved][rows[other], moments[other]]
+        desired[other] = self.relabelled(desired[other], reached, rng)
+        return desired, other
 
     def relabelled(self, desired: Array, reached: Array, rng: np.random.Generator) -> Array:  # noqa: ARG002
         """(n, ...) goals that take the place of the desired ones, of those that were reached."""
@@ -125,7 +128,7 @@ class EpisodeReplay(Ring):
         where = rows * self._spec.horizon + steps
         return self._held[ACTIONS].flatten(0, 1).index_select(0, where)
 
-    def _chosen(self, config: EpisodeConfig, rng: np.random.Generator) -> Ints:
+    def _chosen(self, config: BaseConfig, rng: np.random.Generator) -> Ints:
         """(B,) episodes, by their slots; some of those that moved, where there are such.
 
         Where little moves at first, most achieved goals are reached whatever is done, and teach
@@ -144,11 +147,11 @@ class EpisodeReplay(Ring):
         self._took(self._slots())
 
 
-def later(steps: Ints, horizon: int, goals: tuple[str, ...], rng: np.random.Generator) -> Ints:
+def later(steps: Ints, ends: Ints, goals: tuple[str, ...], rng: np.random.Generator) -> Ints:
     """(B,) a moment after each of these steps: of one of the kinds of `EpisodeConfig.goals`."""
     count = len(steps)
     kinds = rng.integers(len(goals), size=count)
-    future = steps + 1 + np.floor(rng.random(count) * (horizon - steps)).astype(np.int64)
-    moments = {"future": future, "next": steps + 1, "final": np.full(count, horizon)}
+    future = steps + 1 + np.floor(rng.random(count) * (ends - steps)).astype(np.int64)
+    moments = {"future": future, "next": steps + 1, "final": ends}
     chosen: Ints = np.stack([moments[kind] for kind in goals])[kinds, np.arange(count)]
     return chosen

@@ -33,7 +33,7 @@ class PushEnv(Env):
         self.corners: Floats = np.full(shape, AWAY)
         self.goals: Floats = np.full(shape, AWAY)
         self._present: Bools = np.zeros((count, task.layout.tokens), np.bool_)
-        self.refused = [""] * count
+        self.refused, self._ended = [""] * count, np.zeros(count, np.bool_)
         self.unknowns = [self.middle] * count
 
     def reset(self, generators: Generators) -> Arrays:
@@ -48,13 +48,15 @@ class PushEnv(Env):
             self.tables[b].place(every, present, self.unknowns[b])
             self.goals[b] = self.corners_of(desired, present)
             self.corners[b] = self.corners_of(every, present)
-        self.refused = [""] * self.count
+        self.refused, self._ended = [""] * self.count, np.zeros(self.count, np.bool_)
         return self._seen()
 
     def step(self, actions: Singles) -> Step:
-        """Push once on every table."""
+        """Push once on every table on which not all is in place."""
         layout, config = self._task.layout, self._task.config
-        for b, action in enumerate(actions):
+        self.refused = [""] * self.count
+        for b in np.flatnonzero(~self._ended).tolist():
+            action = actions[b]
             push = push_of(layout, self.corners[b], action, config.finger, config.longest)
             self.refused[b] = push.refused
             if not push.refused:
@@ -64,7 +66,8 @@ class PushEnv(Env):
         corners, goals = self.corners.astype(np.float32), self.goals.astype(np.float32)
         placed = self._task.placed(corners, goals)
         rewards = self._task.paid(placed, self._present)
-        return Step(self._seen(), rewards, np.asarray(placed.all(axis=1)))
+        self._ended = np.asarray(placed.all(axis=1))
+        return Step(self._seen(), rewards, self._ended.copy())
 
     def facts(self) -> Arrays:
         """Exact corners and goals, and whether the last push was refused."""

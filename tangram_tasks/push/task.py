@@ -85,7 +85,7 @@ class Push(Task):
 
     An action is a push: which token, where on its edge, in which direction, how far. Where the
     finger cannot come down nothing moves, and the push is spent. A push pays -1, and the share of
-    tokens that then are in place; an episode terminates when all are.
+    tokens that then are in place; an episode terminates when all are, and nothing moves any more.
     """
 
     agent: ClassVar[str] = "push"

@@ -253,6 +253,7 @@ def test_tokens_without_room_are_refused_before_they_are_played() -> None:
         large.check(plays=True)
 
 
+@pytest.mark.filterwarnings("ignore:.*not in the possible render_modes")  # gymnasium's own
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [

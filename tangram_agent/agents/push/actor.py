@@ -41,10 +41,9 @@ class PushActor(NetworkActor):
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
         """(B, 4) of corners and goals (B, V, 2).
 
-        Where it explores, other pushes are drawn each time, some are any, and so is what is done
-        after all is in place.
+        Where it explores, other pushes are drawn each time, and some are any.
         """
-        task, tokens = self._task, self._tokens
+        tokens = self._tokens
         corners, goals = seen["corners"], seen["goals"]
         scene = tokens.scene(corners, goals)
         drawn, any_push = self._drawn(len(corners), explore)
@@ -54,8 +53,7 @@ class PushActor(NetworkActor):
             found = best(self.network.critic, moved, tokens, scene, drawn, looked_at)
         slots, pushes = (one.numpy().copy() for one in found[1:])
         if explore is not None:
-            done = task.placed(corners, goals).all(axis=1)
-            other = (any_push[:, 0] < self._config.uniform_share) | done
+            other = any_push[:, 0] < self._config.uniform_share
             count = scene.present.sum(1).numpy()
             slots = np.where(other, (any_push[:, 1] * count).astype(np.int64), slots)
             pushes = np.where(other, (any_push[:, 2] * PUSHES).astype(np.int64), pushes)

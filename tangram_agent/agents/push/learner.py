@@ -5,6 +5,7 @@ Legend: B transitions, K tokens, V corners, P pushes drawn for each token.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -18,9 +19,11 @@ from tangram_agent.agents.push.networks import Alone, Twins
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, rotated
 from tangram_agent.agents.push.seen import pushes, seen_by
 from tangram_agent.base.learning import Loss, NetworkLearner, Rates
+from tangram_agent.flat.config import EpisodeConfig
 from tangram_agent.flat.replay import EpisodeReplay
 from tangram_agent.nets.weights import to_arrays
 from tangram_core.agent import Streams, Tensors
+from tangram_core.arrays import Ints
 from tangram_core.spec import Array, Arrays, Episodes
 from tangram_tasks.push.places import ways_of
 from tangram_tasks.push.task import Push
@@ -63,10 +66,34 @@ class Batch:
         return Scene(poses, self.goals, self.which, self.present)
 
 
+def lengths(terminated: Array) -> Ints:
+    """(E,) steps to the first at which episodes (E, T) terminated, or all."""
+    ended = terminated.astype(bool)
+    counts: Ints = np.where(ended.any(1), ended.argmax(1) + 1, ended.shape[1])
+    return counts
+
+
 class PushReplay(EpisodeReplay):
     """Goals of hindsight are what was reached, for all tokens or for some."""
 
     some_share = 0.0
+
+    def chosen(self, config: EpisodeConfig, rng: Streams) -> tuple[Ints, Ints, Array]:
+        """Which episodes (B,) and steps (B,) before all was in place, and goals (B, V, 2).
+
+        Raises:
+            ValueError: the replay is empty.
+        """
+        slots = self._slots()
+        if not len(slots):
+            raise ValueError("cannot sample from an empty replay")
+        first = np.cumsum(self._lengths[slots])
+        drawn = rng["replay"].integers(first[-1], size=config.batch_size)
+        at = np.searchsorted(first, drawn, side="right")
+        rows = slots[at]
+        ends = self._lengths[rows]
+        steps = drawn - first[at] + ends
+        return rows, steps, self.goals(config, rows, steps, ends, rng["hindsight"])[0]
 
     def relabelled(self, desired: Array, reached: Array, rng: np.random.Generator) -> Array:
         """See `EpisodeReplay.relabelled`."""
@@ -75,6 +102,14 @@ class PushReplay(EpisodeReplay):
         own |= (rng.random(len(desired)) >= self.some_share)[:, None]
         mask = own[:, layout.token_of_corner, None]
         return np.where(mask, reached, desired)
+
+    def _look(self, slots: Ints) -> None:
+        """Note when episodes ended."""
+        self._lengths[slots] = lengths(self.arrays["terminated"][slots])
+
+    @cached_property
+    def _lengths(self) -> Ints:
+        return np.zeros(self.capacity, np.int64)
 
 
 class PushLearner(NetworkLearner):
@@ -113,7 +148,7 @@ class PushLearner(NetworkLearner):
     def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
         """Keep whole episodes: goals are relabelled when a batch is drawn."""
         self.replay.add(episodes)
-        return episodes.transitions
+        return int(lengths(episodes.terminated).sum())
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
         """One of all networks; now and then the table of pushes is renewed."""
@@ -125,7 +160,7 @@ class PushLearner(NetworkLearner):
     def drawn(self, rng: Streams) -> Batch:
         """What the next update learns from."""
         task, config, arrays = self._task, self.config, self.replay.arrays
-        rows, steps, desired, _ = self.replay.chosen(config, rng)
+        rows, steps, desired = self.replay.chosen(config, rng)
         before, following = (arrays["corners"][rows, steps + i] for i in (0, 1))
         actions = arrays["actions"][rows, steps]
         finger, longest = task.config.finger, task.config.longest
@@ -205,6 +240,7 @@ class PushLearner(NetworkLearner):
         return Loss("alone", mean, {"alone": counts.to(moved.dtype).mean()})
 
     def broadcast(self) -> Tensors:
-        """The critics, and the table of pushes."""
-        critic = {f"critic.{name}": value for name, value in to_arrays(self.critic).items()}
+        """The critics, averaged, and the table of pushes."""
+        averaged = to_arrays(self.targets["critic"])
+        critic = {f"critic.{name}": value for name, value in averaged.items()}
         return {**critic, "table.moved": to_arrays(self.table)["moved"]}

@@ -107,12 +107,14 @@ def test_without_hindsight_all_is_as_it_was_played() -> None:
 )
 def test_goals_are_of_later_moments(kind: str, expected: dict[int, set[int]]) -> None:
     for step, moments in expected.items():
-        found = later(np.full(200, step), 4, (kind,), np.random.default_rng(0))
+        found = later(np.full(200, step), np.full(200, 4), (kind,), np.random.default_rng(0))
         assert set(found.tolist()) == moments
 
 
 def test_several_kinds_are_as_often() -> None:
-    found = later(np.zeros(3000, np.int64), 100, ("next", "final"), np.random.default_rng(0))
+    found = later(
+        np.zeros(3000, np.int64), np.full(3000, 100), ("next", "final"), np.random.default_rng(0)
+    )
     assert set(found.tolist()) == {1, 100}
     assert 0.45 < (found == 1).mean() < 0.55
 

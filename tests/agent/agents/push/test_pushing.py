@@ -176,7 +176,7 @@ def test_targets_pay_and_end_as_the_task_does(monkeypatch: pytest.MonkeyPatch) -
         lambda *a: (torch.full((100,), -1.0), None, None),
     )
     targets = learner._target(learner.drawn(rng)).numpy()
-    rows, steps, desired, _ = chosen["found"]
+    rows, steps, desired = chosen["found"]
     achieved = learner.replay.arrays["corners"][rows, steps + 1]
     ended = loose.ended(achieved, desired, np.zeros(100, bool))
     expected = loose.rewards(achieved, desired) - 0.9 * ~ended
