@@ -3,6 +3,7 @@
 Legend: B transitions, K tokens, V corners, P pushes drawn for each token.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,6 +31,7 @@ from tangram_tasks.push.task import Push
 
 _DRAWN = 96  # P: pushes of which those are taken that a target looks at
 _RENEWED = 20  # updates after which the table of pushes is
+_LAST = 0.1  # share of the learning rate that is left at the end of a budget
 _STILL = 1e-4  # way of a token that did not move
 _TURN = 0.2  # length that a turn by one radian counts as
 
@@ -136,9 +138,11 @@ class PushLearner(NetworkLearner):
         others = {"table": self.table}
         super().__init__(learned, ("critic",), device, compiled=compiled, others=others)
 
-    def rates(self, share: float) -> Rates:  # noqa: ARG002
-        """The same for all networks, and to the end."""
-        return Rates(self.config.learning_rate, self.config.learning_rate, 0.0)
+    def rates(self, share: float) -> Rates:
+        """The same for all networks; they fall along a cosine as the budget is used."""
+        falls = 0.5 * (1.0 + math.cos(math.pi * min(max(share, 0.0), 1.0)))
+        rate = self.config.learning_rate * (_LAST + (1.0 - _LAST) * falls)
+        return Rates(rate, rate, 0.0)
 
     @property
     def kept(self) -> int:
