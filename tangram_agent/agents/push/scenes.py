@@ -117,9 +117,10 @@ class Tokens:
 
     def laid(self, poses: Tensor, which: Tensor) -> Tensor:
         """(..., C, 2) outlines of tokens at poses (..., 3)."""
-        outlines = self.outlines[which]
-        angles = poses[..., 2:].expand(outlines.shape[:-1])
-        return rotated(outlines, angles) + poses[..., None, :2]
+        # A product of matrices: a compiler would unroll sums of two into every corner's use.
+        cos, sin = torch.cos(poses[..., 2]), torch.sin(poses[..., 2])
+        turns = torch.stack([cos, sin, -sin, cos], dim=-1).unflatten(-1, (2, 2))
+        return self.outlines[which] @ turns + poses[..., None, :2]
 
 
 def rotated(vectors: Tensor, angles: Tensor) -> Tensor:
@@ -159,7 +160,7 @@ def gap(some: Tensor, others: Tensor) -> Tensor:
         lengths = edges.norm(dim=-1, keepdim=True)
         normals = torch.stack([edges[..., 1], -edges[..., 0]], dim=-1) / lengths.clamp_min(1e-6)
         furthest = (normals * one).sum(-1)
-        nearest = (normals[..., :, None, :] * other[..., None, :, :]).sum(-1).amin(-1)
+        nearest = (normals @ other.transpose(-1, -2)).amin(-1)
         apart = torch.where(lengths[..., 0] < 1e-6, -torch.inf, nearest - furthest)
         found.append(apart.amax(-1))
     return torch.maximum(*found)
