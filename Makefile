@@ -68,7 +68,6 @@ evidence: .venv/.installed-dev  ## what README and docs show of trainings and do
 	@$(call study,paper_size,paper)
 	@$(call study,parts,laptop)
 	@$(call study,game,laptop)
-	@$(call study,worlds,laptop)
 	@$(call study,pictures,laptop)
 	@$(BIN)/tangram-report runs=docs/results
 	@$(BIN)/tangram-report check

@@ -99,18 +99,15 @@ class Run:
         Args:
             seen: the fields that the task's spec names, B rows each: of tokens their corners (B, V,
                 2), which are placed (B, K), and goals (B, V, 2), or (B, G, 2) rows of outlines.
-            past: what was seen of these episodes before, if anything: an agent that learns what a
-                command comes to corrects itself by it.
+            past: what was seen of these episodes before, if anything.
         """
         return self.actor.act(seen, past or beginning(self.setup.spec, seen))
 
-    def predict(self, observation: Mapping[str, Any], past: History | None = None) -> Singles:
+    def predict(self, observation: Mapping[str, Any]) -> Singles:
         """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
 
         Args:
             observation: of `TangramEnv`, or of `TangramVectorEnv`: each entry with B rows.
-            past: of these B episodes, by which an agent that learned the motion corrects itself;
-                without it, it plays by what is usual.
 
         Returns:
             (A,) in [-1, 1], which `step` takes; (B, A) for B rows.
@@ -124,7 +121,7 @@ class Run:
             for name in ("achieved_goal", "desired_goal")
         )
         flags = shown["observation"][..., -layout.tokens :].reshape(-1, layout.tokens)
-        actions = self.act({"corners": corners, "placed": flags > 0.5, "goals": goals}, past)
+        actions = self.act({"corners": corners, "placed": flags > 0.5, "goals": goals})
         single: Singles = actions if shown["observation"].ndim > 1 else actions[0]
         return single
 

@@ -22,7 +22,6 @@ from tangram_core.store.files import write_whole
 from tangram_core.task import Task
 from tangram_game.config import EvalConfig, source_and_names
 from tangram_game.figures.puzzles import Player, by, find_figures
-from tangram_game.rivals.fitted import fitted_policy
 from tangram_game.scores import (
     RUN,
     Scored,
@@ -60,9 +59,8 @@ def evaluate_run(config: EvalConfig) -> int:
     Policies that learned nothing play the same episodes, to compare with: `exact` moves every
     token exactly onto its target, `position only` one token onto its centre and never turns it,
     `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order that pushes the
-    least out of place. Where a world moves tokens otherwise than actions say, or several noisy
-    looks at them can be put together, `fitted` is `exact` by a model of motion that has seen some
-    random commands, and `oracle` knows that world and its noise.
+    least out of place. Where several noisy looks at tokens can be put together, `oracle` is `exact`
+    by all of them.
 
     Returns:
         Exit status 0.
@@ -94,10 +92,6 @@ def policies(run: Run) -> dict[str, Player]:
     first: dict[str, Player] = {
         name: rivals.pop(name) for name in ("exact", "sweep rule") if name in rivals
     }
-    if isinstance(task, Place) and (
-        task.sim.inexact or (task.sim.corner_noise and task.horizon > 1)
-    ):
-        first["fitted"] = fitted_policy
     return {**result, **first, **rivals}
 
 
@@ -184,13 +178,12 @@ def _title(run: Run) -> str:
 def _told(task: Place) -> str:
     """The settings of the test, in words."""
     sim = task.sim
-    parts = [
+    parts = (
         f"{sim.actions_per_token} action{'s' * (sim.actions_per_token > 1)} a token",
         "exploration off",
         _observed(sim),
         sim.backend if task.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
-    ]
-    parts += [f"world {sim.world}"] if sim.inexact else []
+    )
     return ", ".join(parts)
 
 

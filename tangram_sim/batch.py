@@ -25,7 +25,6 @@ from tangram_sim.motion.actions import (
     horizon,
     velocities,
 )
-from tangram_sim.motion.actuation import Actuation, Command
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
 from tangram_sim.sight.lens import Lens, View
 from tangram_sim.sight.observation_noise import see
@@ -44,8 +43,7 @@ class StepResult:
         camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
         refused: (B,) where the action named a placed token: nothing moved.
         blocked: (B,) where a lifted token could not be set down on others: nothing moved.
-        tokens: (B,) which token moved, or would have: in a delayed world the one that was named a
-            step before.
+        tokens: (B,) which token moved, or would have.
         covered: (B,) share of its area by which a lifted token was, or would have been, set down on
             others; 0 for one that slides.
         done: whether the episodes are over, all at once.
@@ -85,8 +83,7 @@ class BatchedEnv:
     token that has several actions is never placed: a time limit ends its episode, and it could as
     well go on. An action that names a placed token is refused: it moves nothing, but uses up its
     step. One that would set a lifted token down on others by more than `MAX_OVERLAP` of its
-    area moves nothing either, and is one of the token's actions. What is made of an action before a
-    token moves is told in actuation.py.
+    area moves nothing either, and is one of the token's actions.
 
     Attributes:
         count: B.
@@ -99,7 +96,6 @@ class BatchedEnv:
         corners: (B, V, 2) of the tokens.
         placed: (B, K) which tokens are placed.
         goals: (B, V, 2) corners of the targets.
-        actuation: the world that each episode has drawn.
         seen: `corners` as an agent sees them, new noise at every step if there is any, or as they
             are found in pictures.
         seen_goals: (B, G, 2) `goals` as an agent sees them, with one noise for the whole episode,
@@ -150,12 +146,10 @@ class BatchedEnv:
         self.goal_rows = goal_rows(layout, sim)
         self._ends_by_placing = layout.tokens > 1 or sim.actions_per_token == 1
         self._worlds = [make_world(layout, sim) for _ in range(count)]
-        self.actuation = Actuation(sim, count)
         self._lens = Lens(sim)
         observed = eye if sim.looks else None
         self.sight = None if observed is None else Sight(layout, observed, count, sim.arena)
         self._targets: TargetPictures | None = None
-        self._late = np.zeros(count, np.int64), np.zeros((count, 3))  # what was told a step before
         self.pictures: Pixels = np.zeros((count, sim.pixels, sim.pixels), np.uint8)
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
         self.steps_done = self.horizon  # no episode yet
@@ -208,7 +202,6 @@ class BatchedEnv:
             none = np.zeros((self.count, self.layout.tokens), np.bool_)
             starts = Starts(*sample_starts(self.layout, self.sim, targets, generators), none)
         self._generators = generators
-        self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
         self._begin(targets, starts, views)
         if self.sim.observe == "silhouette":
             self.seen_goals = self._outlined()
@@ -217,10 +210,6 @@ class BatchedEnv:
         else:
             self.seen_goals = self.sight.goals
         self._look()
-        self.actuation.begin(generators)
-        if self.sim.dynamics.damping_spread:
-            for world, damping in zip(self._worlds, self.actuation.damping, strict=True):
-                world.damp(float(damping))
         self._moves[:] = self.sim.actions_per_token * starts.placed
         self.steps_done = 0
 
@@ -250,14 +239,12 @@ class BatchedEnv:
         self._moves[np.flatnonzero(~refused), named[~refused]] += 1
         tokens = named if self.sight is None else self.sight.hands(named, self.corners)
         velocity, flip = velocities(actions, self.sim), flips(actions, self.layout, self.sim)
-        command = self.actuation.carry_out(Command(tokens, velocity, flip, refused))
-        covered = self._covered(command)
-        blocked = (covered > MAX_OVERLAP) & ~command.idle
-        camera = self._move(command, command.idle | blocked)
+        command = tokens, velocity, flip
+        covered = self._covered(*command)
+        blocked = (covered > MAX_OVERLAP) & ~refused
+        camera = self._move(*command, refused | blocked)
         if self.sight is not None:
-            told = named, np.where(refused[:, None], 0.0, velocity)
-            self.sight.follow(self.pictures, *(self._late if self.sim.dynamics.delayed else told))
-            self._late = told
+            self.sight.follow(self.pictures, named, np.where(refused[:, None], 0.0, velocity))
         self._look()
         self.steps_done += 1
         share = overlap_share(self.corners, self.goals, self.layout)
@@ -267,7 +254,7 @@ class BatchedEnv:
             camera_rewards=camera,
             refused=refused,
             blocked=blocked,
-            tokens=command.tokens,
+            tokens=tokens,
             covered=covered,
             done=self.steps_done == self.horizon,
         )
@@ -277,18 +264,14 @@ class BatchedEnv:
         for world in self._worlds:
             world.close()
 
-    def _covered(self, command: Command) -> Floats:
+    def _covered(self, tokens: Ints, velocity: Floats, flip: Bools) -> Floats:
         """(B,) share of its area by which each lifted token would be set down on others."""
-        layout, rows, tokens = self.layout, np.arange(self.count), command.tokens
+        layout, rows = self.layout, np.arange(self.count)
         if layout.tokens == 1 or self.sim.motion != "lift":
             return np.zeros(self.count)
         poses, sides = self._poses.copy(), self._flipped.copy()
-        if self.sim.dynamics.falls_short:
-            told = zip(self._worlds, tokens.tolist(), command.velocity, command.flip, strict=True)
-            poses[rows, tokens] = [world.landing(*one) for world, *one in told]
-        else:
-            poses[rows, tokens] += command.velocity
-        sides[rows, tokens] ^= command.flip
+        poses[rows, tokens] += velocity
+        sides[rows, tokens] ^= flip
         pieces = outlines(layout.corners(poses, sides), layout)
         own = np.repeat(pieces[rows, tokens], layout.tokens, axis=0)
         common = shared_area(own, pieces.reshape(own.shape)).reshape(self.count, -1)
@@ -319,12 +302,12 @@ class BatchedEnv:
         """(P, P) of an environment, as the camera has it now."""
         return self._lens.taken(b, self._worlds[b].picture(), self._generators[b])
 
-    def _move(self, command: Command, idle: Bools) -> Floats | None:
+    def _move(self, tokens: Ints, velocity: Floats, flip: Bools, idle: Bools) -> Floats | None:
         """Move in every world; (B,) Eq. 14 of the pictures with the camera on."""
         pictures = []
         for b, world in enumerate(self._worlds):
             if not idle[b]:
-                world.move(int(command.tokens[b]), command.velocity[b], bool(command.flip[b]))
+                world.move(int(tokens[b]), velocity[b], bool(flip[b]))
             if self.sim.pixels:
                 pictures.append(self._picture(b))
         if self._targets is None:

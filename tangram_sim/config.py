@@ -8,7 +8,6 @@ from typing import Any
 from tangram_core.errors import ConfigError
 from tangram_core.run.code import own_code
 from tangram_core.settings import NETWORK, Settings, refuse_ignored, setting, told
-from tangram_sim.dynamics import WORLDS, Dynamics
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense")
@@ -43,14 +42,6 @@ class SimConfig(Settings, section="sim"):
         2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens", part=NETWORK
     )
     actions_per_token: int = setting(1, "actions that each token has", low=1, high=100)
-    world: str = setting(
-        "plain",
-        "what becomes of an action: plain: what it says; bullet: PyBullet by its own defaults, one "
-        "step and a damping of 0.04, stops lifted tokens short; drawn: each episode draws gains of "
-        "x, y and turn from 0.8 to 1.25, biases up to 0.05 full scales and, lifted by the engine, "
-        "a damping up to 0.1; delayed: each action comes one step late",
-        choices=tuple(WORLDS),
-    )
     corner_noise: float = setting(
         0.0,
         "deviation of the Gaussian noise on the corners that agents see; scores are exact",
@@ -128,19 +119,6 @@ class SimConfig(Settings, section="sim"):
         usual = {name: getattr(SimConfig, name) for name in (*CAMERA, "observe")}
         return replace(self, **usual)
 
-    @property
-    def dynamics(self) -> Dynamics:
-        """What the world makes of actions; only the engine damps, and only what it carries."""
-        dynamics = WORLDS[self.world]
-        if self.backend == "physics" and self.motion == "lift":
-            return dynamics
-        return replace(dynamics, damping=0.0, damping_spread=0.0)
-
-    @property
-    def inexact(self) -> bool:
-        """Whether a token that is alone does not go where an action takes it."""
-        return self.world != "plain"
-
     def __post_init__(self) -> None:
         if self.looks:
             self._check_observed()
@@ -149,11 +127,6 @@ class SimConfig(Settings, section="sim"):
             raise ConfigError(
                 "sim.motion=slide needs the engine's contacts, got sim.backend=kinematic: set "
                 "sim.backend=physics, or sim.motion=lift"
-            )
-        if self.world == "bullet" and not self.dynamics.falls_short:
-            raise ConfigError(
-                "sim.world=bullet needs sim.backend=physics and sim.motion=lift, got "
-                f"{self.backend} and {self.motion}: set them, or another sim.world"
             )
         if self.motion == "slide" and self.allow_flip:
             raise ConfigError(

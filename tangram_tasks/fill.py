@@ -79,7 +79,6 @@ class Fill(Place):
             "actions_per_token": 1,
             "allow_flip": self.layout.any_chiral or sim.allow_flip,
             "corner_noise": 0.0,
-            "world": "plain",
         }
         for name, value in wanted.items():
             given = getattr(sim, name)

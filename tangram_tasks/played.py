@@ -9,30 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tangram_core import task
-from tangram_core.arrays import Bools, Floats, Pixels, Singles
+from tangram_core.arrays import Bools, Floats, Pixels
 from tangram_core.spec import Array, Arrays, Episodes
-from tangram_core.task import History
-
-
-@dataclass(frozen=True, eq=False)
-class Past:
-    """What was seen and done in B episodes so far, t actions in each.
-
-    Attributes:
-        corners: (B, t, V, 2) of the tokens before each action.
-        actions: (B, t, A).
-        seen: (B, t + 1, K) which tokens were seen before each action, and now; None: all were.
-    """
-
-    corners: Singles
-    actions: Singles
-    seen: Array | None = None
-
-    @staticmethod
-    def of(history: History) -> "Past":
-        """What of a history is the tokens'."""
-        corners = history.seen["corners"][:, :-1]
-        return Past(corners, history.actions, history.seen.get("seen"))
 
 
 def closed(seen: Arrays) -> Array:

@@ -4,7 +4,7 @@ Legend: M views.
 """
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,7 +69,6 @@ class Ddpg(TokenLearner):
         seed: int,
         device: str,
         compiled: bool,
-        others: Mapping[str, nn.Module] | None = None,
     ) -> None:
         """Networks with the weights of a seed.
 
@@ -80,7 +79,6 @@ class Ddpg(TokenLearner):
             seed: of the weights.
             device: where it learns.
             compiled: whether an update is compiled as a whole, see `Whole`.
-            others: networks that are fitted otherwise.
         """
         self.task, self.config, self.polyak = task, config, config.polyak
         self.bootstraps = config.gamma > 0.0 and task.horizon > 1
@@ -89,7 +87,7 @@ class Ddpg(TokenLearner):
         learned = {"actor": self.actor, "critic": self.critic}
         targets = tuple(learned) if self.bootstraps else ()
         given = config, learned, playing, seed, device
-        super().__init__(*given, targets=targets, compiled=compiled, others=others)
+        super().__init__(*given, targets=targets, compiled=compiled)
         layout = task.layout
         size = layout.corner_count, layout.tokens, task.action_size
         self.replay = ReplayBuffer(config.replay_capacity, *size)

@@ -54,15 +54,6 @@ class Replay(Protocol):
     def load_state(self, state: Mapping[str, Array]) -> None: ...  # noqa: D102
 
 
-class Optimiser(Protocol):
-    """What moves a network, and keeps something of each step."""
-
-    slots: dict[str, list[Tensor]]
-
-    def step(self, *args: Any, **kwargs: Any) -> Any: ...  # noqa: D102
-    def load(self, slots: dict[str, list[Tensor]]) -> None: ...  # noqa: D102
-
-
 class NetworkLearner(Learner):
     """Networks that learn by their losses, and target networks that follow them slowly.
 
@@ -117,7 +108,7 @@ class NetworkLearner(Learner):
         self.lists: dict[str, list[Tensor]] = {
             n: [*one.parameters()] for n, one in self.parts.items()
         }
-        self.optimisers: dict[str, Optimiser] = {name: Adam(self.lists[name]) for name in learned}
+        self.optimisers = {name: Adam(self.lists[name]) for name in learned}
         self.names: dict[bool, tuple[str, ...]] = {}
         self._whole: Callable[[Any, Rates], Tensor] = self.step
         self._traced = compiled
@@ -155,15 +146,12 @@ class NetworkLearner(Learner):
         """See `Learner.update`; its numbers are those of `learn`."""
         return self.learn(self.drawn(rng), share)
 
-    def learn(
-        self, seen: Any, share: float = 0.0, told: Mapping[str, Tensor] | None = None
-    ) -> dict[str, float]:
+    def learn(self, seen: Any, share: float = 0.0) -> dict[str, float]:
         """One step of all networks.
 
         Args:
             seen: what the losses see.
             share: of the run's budget that is used, in [0, 1]; decides the learning rate.
-            told: other numbers () of this update.
 
         Returns:
             Of each network NAME_loss and NAME_gradient, its norm, and what its loss tells.
@@ -172,9 +160,8 @@ class NetworkLearner(Learner):
             NotFiniteError: one of these is not finite.
         """
         found = self._whole(seen, self.rates(share))  # the one wait for the device is below
-        values = [found, *(one[None] for one in (told or {}).values())]
-        names = *self.names[getattr(seen, "acts", True)], *(told or {})
-        numbers = dict(zip(names, torch.cat(values).tolist(), strict=True))
+        names = self.names[getattr(seen, "acts", True)]
+        numbers = dict(zip(names, found.tolist(), strict=True))
         if not all(map(math.isfinite, numbers.values())):
             listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
             raise NotFiniteError(f"update {self.updates + 1} is not finite ({listed})")
@@ -313,7 +300,6 @@ class TokenLearner(NetworkLearner):
         *,
         targets: Iterable[str] = (),
         compiled: bool = False,
-        others: Mapping[str, nn.Module] | None = None,
     ) -> None:
         """Networks with the weights of a seed.
 
@@ -329,8 +315,8 @@ class TokenLearner(NetworkLearner):
             initialise(network, generator)
         self._rates_of, self.capacity = config, config.replay_capacity
         self.acting = frozen(playing)
-        every = {**(others or {}), "acting": self.acting}
-        super().__init__(learned, targets, device, compiled=compiled, others=every)
+        others = {"acting": self.acting}
+        super().__init__(learned, targets, device, compiled=compiled, others=others)
         self.lists["playing"] = list(playing.parameters())
 
     def follow(self, rates: Rates) -> None:

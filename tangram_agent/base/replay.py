@@ -4,8 +4,6 @@ import numpy as np
 
 from tangram_agent.base.ring import Column, Ring
 from tangram_agent.base.types import Transitions
-from tangram_core.arrays import Singles
-from tangram_tasks.played import Past
 
 
 class ReplayBuffer(Ring):
@@ -52,20 +50,3 @@ class ReplayBuffer(Ring):
         """
         rows = self.drawn(size, generator)
         return Transitions(**{name: array[rows] for name, array in self.arrays.items()})
-
-    def sample_episodes(
-        self, count: int, steps: int, generator: np.random.Generator
-    ) -> tuple[Past, Singles]:
-        """Episodes of so many steps, drawn uniformly with replacement: their past and their ends.
-
-        Raises:
-            ValueError: none is whole.
-        """
-        # Rows are added episode by episode, so each begins at a multiple of its steps.
-        first, end = -(-(self.added - len(self)) // steps), self.added // steps
-        if first >= end:
-            raise ValueError(f"the replay buffer holds no whole episode of {steps} steps")
-        begin = generator.integers(first, end, size=count) * steps
-        rows = (begin[:, None] + np.arange(steps)) % self.capacity
-        past = Past(self.arrays["state"][rows], self.arrays["action"][rows])
-        return past, self.arrays["next_state"][rows[:, -1]]

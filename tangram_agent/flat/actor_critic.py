@@ -136,11 +136,9 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         """The same for all networks, and to the end."""
         return Rates(self.config.learning_rate, self.config.learning_rate, 0.0)
 
-    def learn(
-        self, seen: Any, share: float = 0.0, told: Mapping[str, Tensor] | None = None
-    ) -> dict[str, float]:
+    def learn(self, seen: Any, share: float = 0.0) -> dict[str, float]:
         """See `NetworkLearner.learn`; refuse losses that leave a network out."""
-        numbers = super().learn(seen, share, told)
+        numbers = super().learn(seen, share)
         if len(self.names) == min(self.delay, 2):  # each form of an update was made
             found = {name for names in self.names.values() for name in names}
             for name in self.optimisers:

@@ -8,7 +8,6 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.motion.actuation import full_scale, reach
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.sight.observation_noise import noise_bound
 
@@ -25,25 +24,24 @@ def horizon(tokens: int, sim: SimConfig) -> int:
     return tokens * sim.actions_per_token
 
 
+def full_scale(sim: SimConfig) -> Floats:
+    """(3,) what an entry of 1 moves in a second: the arena's width in x and in y, half a turn."""
+    return np.array([sim.arena, sim.arena, np.pi])
+
+
 def corner_bound(tokens: int, sim: SimConfig) -> float:
     """The largest |coordinate| that a corner can reach in an episode, arena units.
 
-    A start lies inside the arena, and each action moves a token in x and in y by at most what it
-    can be told, which is the arena's width unless the world says otherwise; turning keeps a corner
-    within the start's margin for every angle. A token that slides may push another as far as it
-    goes itself, in each action of the episode; one that settles moves others by less than an arena,
-    wherever it was set down. What an agent sees may lie further out by the noise's bound. Pictures
-    show a token with its middle in them, wherever the camera stands, and while they show nothing
-    of it, it is taken to lie where it was told to go, whatever the world makes of that.
+    A start lies inside the arena, and each action moves a token in x and in y by at most the
+    arena's width; turning keeps a corner within the start's margin for every angle. A token that
+    slides may push another as far, in each action of the episode; one that settles moves others by
+    less, wherever it was set down. What an agent sees may lie further out by the noise's bound.
+    Pictures show a token with its middle in them, wherever the camera stands, and while they show
+    nothing of it, it is taken to lie where it was told to go.
     """
     pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
-    inside = 0.5
-    way = float(reach(sim)[:2].max())
-    if sim.looks:
-        way, inside = max(way, 1.0), 1.0
-    # One that only turns pushes others by less than an arena, too.
-    push = max(way, 1.0) if sim.motion == "slide" else 1.0
-    moved = sim.actions_per_token * way + pushes * push
+    inside = 1.0 if sim.looks else 0.5
+    moved = sim.actions_per_token + pushes
     return (sim.arena * (inside + moved) + noise_bound(sim)) * _ROUNDING
 
 

@@ -30,14 +30,6 @@ class KinematicWorld:
         self._poses[token] += velocity
         self._poses[token, 2] = wrap(self._poses[token, 2])
 
-    def landing(self, token: int, velocity: Floats, flip: bool = False) -> Floats:  # noqa: ARG002 - a side is no matter of the pose
-        """See `World.landing`."""
-        pose: Floats = self._poses[token] + velocity
-        return pose
-
-    def damp(self, damping: float) -> None:
-        """See `World.damp`: nothing damps the exact motion, and `SimConfig` asks for none."""
-
     def poses(self) -> Floats:
         """See `World.poses`."""
         return self._poses.copy()

@@ -18,7 +18,6 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines
 from tangram_sim.geometry.prisms import thickness
 from tangram_sim.geometry.shapes import Shape, mirror_image, tan, turn_onto
-from tangram_sim.motion.actions import horizon
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.puzzles.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import library
@@ -99,11 +98,6 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         given, usual = f"sim.motion={sim.motion}", SimConfig.motion
         refuse_ignored(given, "one token", "take a set of several", usual)
     _check_thick(layout, sim)
-    if sim.dynamics.delayed and horizon(layout.tokens, sim) == 1:
-        raise ConfigError(
-            "sim.world=delayed moves nothing in an episode of one action: raise "
-            "sim.actions_per_token to at least 2, or set sim.world=plain"
-        )
     if sim.starts == "piles" and layout.tokens == 1:
         refuse_ignored("sim.starts=piles", "one token", "take a set of several")
     if sim.looks:

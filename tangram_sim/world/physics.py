@@ -40,6 +40,10 @@ _SETTLED = 1e-5  # deepest overlap that stays
 _SETTLE_STEPS, _SETTLE_S = 200, 1.0 / 240.0
 _DISTANCE = 8  # of two bodies, in what the engine tells of a contact
 
+# Least simulation steps in one action of one second. One step turns exactly up to pi / 4 and too
+# little beyond, so that a half turn needs four.
+_SUBSTEPS = 8
+
 _Command = tuple[float, float, float]
 
 
@@ -58,7 +62,6 @@ class PhysicsWorld:
                 "close environments, or use fewer of them"
             )
         self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
-        self._substeps = sim.dynamics.substeps
         self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
         self._radius = (layout.radii * self._unit).tolist()
         thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
@@ -69,8 +72,6 @@ class PhysicsWorld:
         self._masses = [(one[0], one[2][2]) for one in told]  # and inertia about the vertical
         for token in range(layout.tokens):
             self._weigh(token, 1.0)
-        # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
-        self.damp(sim.dynamics.damping)
         self._play_at_once()
         if sim.pixels:
             self._pixels = sim.pixels
@@ -92,27 +93,6 @@ class PhysicsWorld:
             self._slide(token, command)
         else:
             self._lift(token, command, flip)
-
-    def landing(self, token: int, velocity: Floats, flip: bool = False) -> Floats:
-        """See `World.landing`."""
-        poses = [self._pose(other) for other in range(len(self._bodies))]
-        self._carry(token, self._command(velocity), flip, _LIFTED)
-        landing = np.array(self._pose(token))
-        self._flipped[token] ^= flip
-        self._put_all(poses)
-        landing[:2] /= self._unit
-        return landing
-
-    def damp(self, damping: float) -> None:
-        """See `World.damp`."""
-        for body in self._bodies:
-            pybullet.changeDynamics(
-                body,
-                -1,
-                linearDamping=damping,
-                angularDamping=damping,
-                physicsClientId=self._client,
-            )
 
     def poses(self) -> Floats:
         """See `World.poses`."""
@@ -169,7 +149,7 @@ class PhysicsWorld:
         """
         start, way = np.array(self._pose(token)), np.array(command)
         longest = math.hypot(*command[:2]) + abs(command[2]) * self._radius[token]
-        steps = max(self._substeps, math.ceil(longest / self._stride))
+        steps = max(_SUBSTEPS, math.ceil(longest / self._stride))
         self._weigh(token, _GRIP)
         self._play_steps_of(1.0 / steps)
         for step in range(1, steps + 1):
@@ -216,10 +196,10 @@ class PhysicsWorld:
             self._set_velocity(token, 0.0, 0.0, 0.0)
 
     def _play_at_once(self) -> None:
-        """Let one call of stepSimulation play the second of an action, in `substeps` steps."""
+        """Let one call of stepSimulation play the second of an action, in `_SUBSTEPS` steps."""
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=1.0,
-            numSubSteps=self._substeps,
+            numSubSteps=_SUBSTEPS,
             contactERP=_RECOVERY,
             contactSlop=0.0,
             deterministicOverlappingPairs=1,
@@ -256,6 +236,9 @@ class PhysicsWorld:
             -1,
             collisionMargin=margin,
             lateralFriction=_FRICTION,
+            # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
+            linearDamping=0.0,
+            angularDamping=0.0,
             physicsClientId=self._client,
         )
         if self._alone:

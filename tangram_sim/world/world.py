@@ -40,12 +40,6 @@ class World(Protocol):
             flip: turn it over in the air, about its body's x axis, before it moves; a chiral one.
         """
 
-    def landing(self, token: int, velocity: Floats, flip: bool = False) -> Floats:
-        """(3,) the pose at which `move` would set a lifted token down; nothing is moved."""
-
-    def damp(self, damping: float) -> None:
-        """Damp every motion by so much from now on; only the engine does."""
-
     def poses(self) -> Floats:
         """(K, 3) x, y and angle in (-pi, pi]."""
 

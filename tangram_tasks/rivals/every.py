@@ -15,15 +15,15 @@ def rivals_of(layout: Layout, sim: SimConfig) -> Mapping[str, Callable[[Env], Ch
 
     `exact` moves every token exactly onto its target, `position only` one token onto its centre and
     never turns it, `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order
-    that pushes the least out of place. Where a world moves tokens otherwise than actions say, or
-    several noisy looks at them can be put together, `oracle` knows that world and its noise.
+    that pushes the least out of place. Where several noisy looks at tokens can be put together,
+    `oracle` is `exact` by all of them.
     """
     several = layout.tokens > 1 or sim.actions_per_token > 1
     found: dict[str, Callable[[Env], Chooser]] = {"exact": lambda _: exact_policy(layout, sim)}
     if sim.motion == "slide" and layout.tokens <= MAX_TOKENS:
         found["sweep rule"] = lambda _: sweep_policy(layout, sim)
-    if sim.inexact or (sim.corner_noise and several):
-        found["oracle"] = oracle_policy
+    if sim.corner_noise and several:
+        found["oracle"] = lambda _: oracle_policy(layout, sim)
     if layout.tokens == 1:
         found["position only"] = lambda _: position_policy(layout, sim)
     return found | {"random": lambda _: random_policy(layout, sim)}

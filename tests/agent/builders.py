@@ -16,7 +16,6 @@ from tangram_agent.runs import beginning
 from tangram_core.agent import Weights
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes, EpisodeSpec
-from tangram_core.task import History
 
 SQUARE = {"shapes": ["square"], "scale": 1.131370849898476}  # side 0.4
 PAIR = {"shapes": ["square", "large_triangle"], "scale": 0.8}
@@ -28,9 +27,9 @@ PAPER = {
     "acting_average": 0.0,
     "lr_final": 1.0,
 }
-# One relabelled goal, and on pairs one proposal of exact motion: what most tests need.
+# One relabelled goal, and on pairs one proposal: what most tests need.
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
-PROPOSAL = {"reapply": 0, "motion": "exact"}
+PROPOSAL = {"reapply": 0}
 SCENE = {"kind": "scene"}
 SMALL = {"width": 16, "layers": 2, "feed_forward": 32}
 
@@ -89,21 +88,14 @@ class Policy:
         self.actor.load(weights.tensors)
         self.version = weights.version
 
-    def act(self, corners: Any, placed: Any, goals: Any, past: History | None = None) -> Any:
+    def act(self, corners: Any, placed: Any, goals: Any) -> Any:
         """As well as it can."""
-        return self.explore(corners, placed, goals, None, past)
+        return self.explore(corners, placed, goals, None)
 
-    def explore(
-        self, corners: Any, placed: Any, goals: Any, generators: Any, past: History | None = None
-    ) -> Any:
+    def explore(self, corners: Any, placed: Any, goals: Any, generators: Any) -> Any:
         """With exploration."""
         seen = {"corners": corners, "placed": placed, "goals": goals}
-        return self.actor.act(seen, past or beginning(self.made.spec, seen), generators)
-
-
-def history(corners: Any, actions: Any) -> History:
-    """Of corners (B, t + 1, V, 2), the last of them now, and actions (B, t, A)."""
-    return History({"corners": corners}, actions)
+        return self.actor.act(seen, beginning(self.made.spec, seen), generators)
 
 
 def one_tensor(dtype: str, shape: list[int], data: bytes = bytes(4)) -> bytes:

@@ -14,12 +14,10 @@ from tangram_agent.runs import Run
 from tangram_core.agent import Weights
 from tangram_core.errors import ConfigError, RunError, WireError
 from tangram_core.setup import Setup
-from tangram_core.task import History
 from tangram_core.wire.messages import decode_weights
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.env import TangramEnv
-from tangram_sim.motion.actions import chosen_tokens, flips, velocities
-from tangram_sim.motion.actuation import full_scale
+from tangram_sim.motion.actions import chosen_tokens, flips, full_scale, velocities
 from tangram_sim.vector import TangramVectorEnv
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
 from tests.agent.builders import (
@@ -28,7 +26,6 @@ from tests.agent.builders import (
     SCENE,
     SMALL,
     Policy,
-    history,
     learn,
     learner_of,
     random_transitions,
@@ -54,11 +51,6 @@ def policy_of(made: Setup) -> Policy:
 
 def scene_of(batch: Transitions) -> Scene:
     return batch.state, batch.placed, batch.goal
-
-
-def past_of(batch: Transitions) -> History:
-    """One action that did not do what it should have."""
-    return history(np.stack([batch.state, batch.state], axis=1), batch.action[:, None])
 
 
 def generators(count: int) -> list[np.random.Generator]:
@@ -91,7 +83,7 @@ def test_weights_travel_to_workers(made: Setup) -> None:
 ONE = {"shapes": ["parallelogram"], "scale": 0.8}
 HAS_A_SAY = [
     (setup(agent=PAPER), False),
-    (setup(agent={"reapply": 2, "motion": "learned"}), False),
+    (setup(agent={"reapply": 2}), False),
     (setup(ONE), False),
     (setup(ONE, mirrored=0.5), False),
     (setup(ONE, allow_flip=True), True),
@@ -115,11 +107,10 @@ def test_a_critic_travels_where_it_has_a_say_in_what_is_played(made: Setup, has:
     told.load(sent)
     batch, knows = random_transitions(made, 20), policy_of(made)
     scene = scene_of(batch)
-    for past in (None, past_of(batch)):
-        np.testing.assert_array_equal(told.act(*scene, past=past), knows.act(*scene, past=past))
-        one, other = (p.explore(*scene, generators(20), past) for p in (told, knows))
-        np.testing.assert_array_equal(one, other)
-        assert np.isfinite(one).all()
+    np.testing.assert_array_equal(told.act(*scene), knows.act(*scene))
+    one, other = (p.explore(*scene, generators(20)) for p in (told, knows))
+    np.testing.assert_array_equal(one, other)
+    assert np.isfinite(one).all()
 
 
 def test_what_travels_is_no_checkpoint() -> None:
@@ -361,7 +352,6 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
         ("agent", "odd", 1, "there is no setting agent.odd"),
         ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
         ("agent", "kind", "scene", "agent.kind=scene does not fit .*kind=pair: leave"),
-        ("agent", "motion", "learned", "agent.motion=learned does not fit this run, whose weights"),
         ("sim", "arena", 3.0, "trained with sim.arena=2: leave it out, or train a run with it"),
         ("sim", "motion", "slide", "run with sim.motion=slide: .* needs the engine's contacts"),
     ],

@@ -81,7 +81,7 @@ def test_a_broken_run_is_refused_in_clear_words(run_dir: Path, harm: Any, reason
     ("section", "content"),
     [
         ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
-        ("agent", {"kind": "pair", "motion": "exact", "reapply": 0}),
+        ("agent", {"kind": "scene"}),
         ("net", {**SMALL, "scale": "sqrt_d"}),
         ("sim", {"arena": 3.0}),
     ],

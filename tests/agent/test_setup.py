@@ -118,7 +118,7 @@ def test_a_master_and_a_worker_with_different_reward_files_differ(tmp_path: Path
 def test_settings_that_only_one_version_knows_do_not_differ() -> None:
     made = make_setup(BASE)
     older = made.contents()
-    del older["agent"]["motion"], older["agent"]["hindsight"][0]["angle"], older["reward"]
+    del older["agent"]["reapply"], older["agent"]["hindsight"][0]["angle"], older["reward"]
     assert made.differences(older | {"newer": {}}) == []
     assert made.differences(3) == ["agent", "net", "reward", "sim", "task", "tokens"]
     older["agent"]["hindsight"][0]["copies"] = 7

@@ -43,7 +43,7 @@ TINY = {"width": 8, "layers": 1, "feed_forward": 8}
 FEW = {"batch_size": 8, "learning_starts": 8, "replay_capacity": 64}
 OF_TOKENS = {
     "scene": setup(agent=SCENE | FEW, net=TINY, actions_per_token=2),
-    "pair": setup(PAIR, FEW | {"motion": "learned"}, TINY),
+    "pair": setup(PAIR, FEW, TINY),
     "pair of pictures": setup(SQUARE, FEW, TINY, observe="pictures", pixels=64),
     "outline": outline_setup(agent=FEW, net=TINY),
 }

@@ -14,17 +14,16 @@ from tangram_agent.base.types import Choice
 from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
-from tangram_sim.motion.actions import make_actions
+from tangram_sim.motion.actions import make_actions, velocities_of
 from tangram_tasks.place import Place
-from tangram_tasks.played import Past, closed
+from tangram_tasks.played import closed
 
 
 class PairActor(NetworkActor):
     """Chooses token, side and pose by a `Planner`."""
 
     def __init__(self, task: Place, config: PairConfig, net: NetConfig) -> None:
-        learned = config.motion == "learned"
-        networks = Networks(task.layout, task.sim.arena, net, motion=learned)
+        networks = Networks(task.layout, task.sim.arena, net)
         super().__init__(networks)
         self._task, self._config = task, config
         self._critic_plays = critic_plays(task)
@@ -34,14 +33,11 @@ class PairActor(NetworkActor):
         """Not the critic, where there is one proposal and nothing to choose."""
         return self._critic_plays or not name.startswith("critic.")
 
-    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:
-        """Actions (B, A), noisy or anything at all where it explores.
-
-        An agent that learns what a command comes to corrects itself by the past.
-        """
+    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
+        """Actions (B, A), noisy or anything at all where it explores."""
         corners, goals = (np.asarray(seen[name], np.float64) for name in ("corners", "goals"))
         flags = np.asarray(closed(seen), np.bool_)
-        actions = self._actions(self._planner.choose(corners, flags, goals, Past.of(past)))
+        actions = self._actions(self._planner.choose(corners, flags, goals))
         if explore is None:
             return actions
         for i, (action, generator) in enumerate(zip(actions, explore, strict=True)):
@@ -70,7 +66,8 @@ class PairActor(NetworkActor):
         token = int(generator.choice(left)) if len(left) else 0
         wanted = generator.uniform(-1.0, 1.0, 3) * (sim.arena / 2.0, sim.arena / 2.0, np.pi)
         flip = sim.allow_flip and generator.choice((-1.0, 1.0)) > 0.0
-        velocity = self._planner.velocity_to(here[None, token], wanted[None])
+        way = velocities_of(wanted[None] - here[None, token], sim).astype(np.float32)
+        velocity = np.clip(way, -1.0, 1.0)
         action: Singles = self._actions(Choice(np.array([token]), np.array([flip]), velocity))[0]
         return action
 

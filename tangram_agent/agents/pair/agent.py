@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 from tangram_agent.base.agent import TokenAgent, seen_tokens
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
-from tangram_core.settings import NETWORK, refuse_ignored, setting, told
+from tangram_core.settings import refuse_ignored, setting, told
 from tangram_core.task import Task
 from tangram_sim.config import RewardConfig
 from tangram_tasks.place import Place
@@ -19,13 +19,6 @@ if TYPE_CHECKING:  # need torch
 class PairConfig(ActorCriticConfig, section="agent"):
     """DDPG on pairs of a token and a piece of the target."""
 
-    motion: str = setting(
-        "learned",
-        "what a command comes to: learned from the replay, and watched in each episode; or the "
-        "exact rigid motion",
-        choices=("learned", "exact"),
-        part=NETWORK,
-    )
     reapply: int = setting(
         2, "times that the actor is applied again to what it proposed", low=0, high=100
     )

@@ -8,7 +8,6 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.agents.pair.motion import MotionModel
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.base.config import NetConfig
 from tangram_agent.nets.networks import VELOCITY, Head
@@ -66,10 +65,9 @@ class CriticNet(nn.Module):
 
 
 class Networks(nn.Module):
-    """All that plays: the critic chooses among what the actor proposes, by a model of motion."""
+    """All that plays: the critic chooses among what the actor proposes."""
 
-    def __init__(self, layout: Layout, arena: float, net: NetConfig, *, motion: bool) -> None:
+    def __init__(self, layout: Layout, arena: float, net: NetConfig) -> None:
         super().__init__()
         graph = PairGraph(layout, arena)
         self.actor, self.critic = ActorNet(graph, net), CriticNet(graph, net)
-        self.motion = MotionModel() if motion else None

@@ -14,15 +14,12 @@ import torch
 from torch import Tensor
 
 from tangram_agent.agents.pair.coverage import covered_share, covering, worths
-from tangram_agent.agents.pair.motion import Belief, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.base.acting import tensor
 from tangram_agent.base.types import Choice
-from tangram_core.arrays import Bools, Floats, Singles
-from tangram_sim.motion.actions import velocities_of
+from tangram_core.arrays import Bools, Floats
 from tangram_tasks.place import Place
-from tangram_tasks.played import Past
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
 
@@ -100,64 +97,27 @@ class Planner:
 
     def __init__(self, networks: Networks, task: Place, reapply: int) -> None:
         self._networks, self._layout, self._reapply = networks, task.layout, reapply
-        self._motion, self._sim = networks.motion, task.sim
+        self._sim = task.sim
         self._graph = PairGraph(task.layout, task.sim.arena)
         self._turns_over = task.layout.chiral & task.sim.allow_flip
 
-    def choose(
-        self, corners: Floats, placed: Bools, goals: Floats, past: Past | None = None
-    ) -> Choice:
+    def choose(self, corners: Floats, placed: Bools, goals: Floats) -> Choice:
         """What to play; where all tokens are placed, some action of the first one.
 
         Args:
             corners: (B, V, 2) of the tokens.
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) of the target.
-            past: what was seen of these episodes before, if anything.
         """
         is_open: Bools = ~np.asarray(placed, np.bool_)
         is_open[~is_open.any(axis=1), 0] = True
         with torch.no_grad():
-            belief = self._belief(corners, past)
-            if self._motion is not None and belief is not None and past is not None:
-                corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
             scene = self._scene(corners, goals)
             candidates, pose = self._short_list(scene, is_open)
-            velocity, reached = self._reached(scene, candidates, pose, belief)
-            best = self._best(scene, candidates, reached)
+            velocity = self._graph.way(scene.pairs(candidates), pose).clamp(-1.0, 1.0)
+            best = self._best(scene, candidates, pose)
         chosen = candidates.at(best)
         return Choice(chosen.token.numpy(), chosen.flip.numpy() > 0.5, velocity[best].numpy())
-
-    def velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
-        """Commands (B, 3) that take tokens from poses (B, 3) to others, in worlds not yet seen."""
-        way = torch.from_numpy(velocities_of(wanted - pose, self._sim).astype(np.float32))
-        with torch.no_grad():
-            prior = None if self._motion is None else self._motion.prior(len(way))
-            return self._command(way, prior).numpy()
-
-    def _belief(self, corners: Floats, past: Past | None) -> Belief | None:
-        """What is believed of the motion in each environment; None: it is taken to be exact."""
-        if self._motion is None:
-            return None
-        if past is None:
-            return self._motion.prior(len(corners))
-        return self._motion.belief(motions_of(past, corners, self._layout, self._sim))
-
-    def _command(self, way: Tensor, belief: Belief | None) -> Tensor:
-        if self._motion is None or belief is None:
-            return way.clamp(-1.0, 1.0)
-        return self._motion.command(belief, way)
-
-    def _reached(
-        self, scene: Scene, candidates: Candidates, pose: Tensor, belief: Belief | None
-    ) -> tuple[Tensor, Tensor]:
-        """Commands (M, 3) that take tokens to poses (M, 3), and the poses that they come to."""
-        pairs = scene.pairs(candidates)
-        own = None if belief is None else belief.at(candidates.row)
-        command = self._command(self._graph.way(pairs, pose), own)
-        if self._motion is None or own is None:
-            return command, pose
-        return command, self._graph.moved(pairs, self._motion.predict(own, command)[0]).pose
 
     def _scene(self, corners: Floats, goals: Floats) -> Scene:
         layout = self._layout

@@ -298,7 +298,6 @@ def test_a_restored_learner_goes_on_bit_for_bit(case: tuple[str, str]) -> None:
         (seven(TWINS, PERCEPTRON), seven(TWINS), "weights of another"),
         (seven(TWINS, PERCEPTRON), seven(TWINS, MLP | {"hidden": [8]}), "weights of another"),
         (seven(TWINS, PERCEPTRON), seven(SCENE, PERCEPTRON), "weights of another"),
-        (setup(), setup(agent={"motion": "learned"}), "set agent.motion=exact, as it was trained"),
     ],
 )
 def test_weights_of_another_network_are_refused(made: Setup, other: Setup, reason: str) -> None:

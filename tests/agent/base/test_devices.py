@@ -6,15 +6,12 @@ the wrong device, or an update that waits for the device on its way, ends in an 
 
 import numpy as np
 import pytest
-import torch
 
-from tangram_agent.agents.pair.motion import Fit, MotionModel
 from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_core.setup import Setup
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.agents.outline.test_filling_learning import episode
 from tests.agent.agents.pair.pair_scenes import transitions
-from tests.agent.agents.pair.test_motion import commands, seen
 from tests.agent.base.test_ddpg import CASES
 from tests.agent.builders import learner_of, random_transitions
 
@@ -55,15 +52,6 @@ def test_a_traced_update_stays_on_its_device(
     learner = learner_of(made, 0, META, compiled=True)
     numbers = learner._whole(steps_of(learner, made, None), learner.rates(0.5))
     assert (numbers.device.type, len(numbers)) == (META, 6)
-
-
-@pytest.mark.fast
-def test_the_fit_of_a_motion_stays_on_its_device() -> None:
-    motions = seen(commands(8), commands(8))
-    fit = Fit(MotionModel().to(META))
-    for _ in range(2):  # the second adds to what the first kept
-        found = fit.step(motions.to(torch.device(META)))
-    assert {one.device.type for one in found.values()} == {META}
 
 
 @pytest.mark.fast

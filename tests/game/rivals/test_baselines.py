@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from tangram_core.task import Chooser, History
-from tangram_game.rivals.fitted import fitted_policy
 from tangram_sim.motion.kinematics import wrap
 from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
@@ -44,70 +43,19 @@ def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -
     assert scores["angle_error_deg_p90"] < 1e-2
 
 
-# Worlds that are not plain, and so few actions in them that the formula repeated does not arrive.
-WORLDS: list[tuple[dict[str, Any], int]] = [
-    ({"backend": "physics", "world": "bullet"}, 2),
-    ({"backend": "physics", "world": "drawn"}, 2),
-    ({"world": "drawn", "arena": 5.0}, 2),
-    ({"world": "delayed"}, 3),
-]
-
-
-@pytest.mark.parametrize(("sim", "actions"), WORLDS)
-@pytest.mark.parametrize("shape", ["square", "parallelogram", "large_triangle"])
-def test_the_oracle_ends_on_its_target_in_every_world(
-    sim: dict[str, Any], actions: int, shape: str
-) -> None:
-    made = setup({"shapes": [shape], "scale": 0.8}, **sim, actions_per_token=actions).task
-    with closing(FixedTests(made, 16, 8)) as tests:
-        oracle = made.score(tests.play(oracle_policy(tests.env)))
-        formula = made.score(tests.play(exact_policy(made.layout, made.sim)))
-    assert oracle["position_error_p90"] < 1e-5 * made.sim.arena
-    assert oracle["angle_error_deg_p90"] < 1e-2
-    short = formula["position_error_p90"] / 1e-3 / made.sim.arena
-    assert max(short, formula["angle_error_deg_p90"] / 0.5) > 1.0
-
-
-def test_worlds_that_are_tried_in_have_no_camera() -> None:
-    seen = {"observe": "pictures", "pixels": 64, "disturbance": 1.0}
-    made = setup(SQUARE, backend="physics", world="bullet", **seen).task
-    with closing(FixedTests(made, 2, 2)) as tests:
-        assert Played.of(tests.play(oracle_policy(tests.env))).camera is not None
-
-
-@pytest.mark.parametrize(("sim", "actions"), [({"world": "delayed"}, 2), WORLDS[0]])
-def test_a_fitted_model_of_motion_serves_the_formula(sim: dict[str, Any], actions: int) -> None:
-    made = setup(SQUARE, **sim, actions_per_token=actions).task
-    with closing(FixedTests(made, 16, 8)) as tests:
-        fitted = made.score(tests.play(fitted_policy(tests.env)))
-    assert fitted["mean_reward"] > 0.995
-
-
-@pytest.mark.parametrize("sim", [{}, {"world": "delayed"}, {"world": "drawn"}])
+@pytest.mark.parametrize("sim", [{}, {"backend": "physics"}])
 @pytest.mark.parametrize("tokens", [SQUARE, PAIR], ids=["one", "two"])
 def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any]) -> None:
     """The look at the target is one: its noise is left, and of eight looks at a token a third."""
     made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim).task
     found = []
     with closing(FixedTests(made, 30, 15)) as tests:
-        for player in (oracle_policy, lambda _: exact_policy(made.layout, made.sim)):
-            played = Played.of(tests.play(player(tests.env)))
+        for policy in (oracle_policy, exact_policy):
+            played = Played.of(tests.play(policy(made.layout, made.sim)))
             # From where the target is seen: what no policy can know is no matter here.
             ends, goals = (made.layout.poses(c) for c in (played.ends, played.episodes["goals"]))
             found.append(np.median(np.abs(ends - goals)[..., :2]))
     assert found[0] < 0.7 * found[1]
-
-
-@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}])
-def test_the_oracle_plays_several_tokens(sim: dict[str, Any]) -> None:
-    sim = sim | {"backend": "physics", "starts": "outside", "arena": 3.0}
-    tokens = {"shapes": ["square", "parallelogram"], "scale": 0.6}
-    made = setup(tokens, **sim, world="drawn", actions_per_token=3).task
-    with closing(FixedTests(made, 8, 8)) as tests:
-        oracle = made.score(tests.play(oracle_policy(tests.env)))
-        formula = made.score(tests.play(exact_policy(made.layout, made.sim)))
-    assert oracle["coverage"] > 0.999
-    assert formula["coverage"] < oracle["coverage"] - 0.01
 
 
 @pytest.mark.parametrize("shape", SHAPES)

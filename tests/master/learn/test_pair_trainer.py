@@ -29,7 +29,7 @@ def test_replay_holds_what_was_played_and_nothing_relabelled() -> None:
 
 
 def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints() -> None:
-    made = setup(agent=AGENT | {"kind": "pair", "motion": "learned", "gamma": 0.0})
+    made = setup(agent=AGENT | {"kind": "pair", "gamma": 0.0})
     master, policy = trainer(made), Policy(made)
     play_on(master, 1)
     arrays, _ = master.state()
@@ -39,4 +39,4 @@ def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints() -> No
         {name.partition(".")[0] for name in one}
         for one in (master.weights().tensors, arrays[ACTING])
     ]
-    assert parts == [{"actor", "motion"}, {"actor", "critic", "motion"}]
+    assert parts == [{"actor"}, {"actor", "critic"}]

@@ -189,9 +189,9 @@ def test_another_task_is_refused_before_anything_is_read_but_what_is_there(tmp_p
 
 
 def test_networks_that_would_mean_something_else_are_not_gone_on_with() -> None:
-    made, other = (seven({"motion": motion}, PERCEPTRON) for motion in ("learned", "exact"))
+    made, other = (seven({}, PERCEPTRON, arena=arena) for arena in (2.0, 3.0))
     check_same_task(made, made.contents())
-    with pytest.raises(RunError, match="other settings of agent.motion: resume it with its own"):
+    with pytest.raises(RunError, match="other settings of sim.arena: resume it with its own"):
         check_same_task(other, made.contents())
 
 
@@ -207,7 +207,7 @@ def saved(folder: Path, made: Trainer) -> Path:
 def test_a_warm_start_takes_the_networks_and_nothing_else(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    made = small_setup(motion="learned")
+    made = small_setup()
     source, fresh = trainer(made), trainer(made, seed=99)
     play_on(source, 2)
     caplog.set_level(logging.INFO)
@@ -217,12 +217,8 @@ def test_a_warm_start_takes_the_networks_and_nothing_else(
     ours, theirs = fresh.learner.state(), source.learner.state()
     networks = [name for name in theirs if "optimiser" not in name and name != "updates"]
     assert len(networks) > 5
-    # But for the motion, which is learned anew: what was learned of another world is too sure.
-    begun = trainer(made).learner.state()
     for name in networks:
-        expected = begun if "motion." in name else theirs
-        np.testing.assert_array_equal(ours[name], expected[name], err_msg=name)
-    assert any(not np.array_equal(begun[n], theirs[n]) for n in networks if "motion." in n)
+        np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
     assert not any(own.any() for name, own in ours.items() if "optimiser" in name)
     assert (fresh.updates, fresh.episodes, len(fresh.learner.replay)) == (0, 0, 0)
 

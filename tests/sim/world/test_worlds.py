@@ -73,16 +73,6 @@ def test_commanded_pose_is_reached_in_every_unit(
     assert angle < 1e-3
 
 
-@pytest.mark.parametrize(("name", "way", "turn"), [("plain", 1.0, 1.0), ("bullet", 0.94, 0.903)])
-def test_damping_makes_tokens_fall_short(name: str, way: float, turn: float) -> None:
-    """With Bullet's own 0.04 a tenth of a turn is missing, and more of a faster one."""
-    world = make_world(layout_of("square"), SimConfig(world=name))
-    world.place(np.zeros((1, 3)))
-    world.move(0, np.array([0.5, 0.0, 1.0]))
-    np.testing.assert_allclose(world.poses()[0], [0.5 * way, 0.0, turn], atol=2e-3)
-    world.close()
-
-
 def test_poses_are_what_was_placed(make: WorldMaker) -> None:
     layout = layout_of(*TRIO)
     world = make(layout)

@@ -13,7 +13,7 @@ from tangram_core.spec import Arrays, Episodes, joined
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_tasks.env import PlaceEnv
 from tangram_tasks.played import Played
-from tests.agent.builders import PAIR, SQUARE, Policy, history, setup
+from tests.agent.builders import PAIR, SQUARE, Policy, setup
 from tests.sim.builders import sample_poses
 from tests.worker.builders import policy
 from worker.play.rollout import Rollout, exploring, parts, play
@@ -39,11 +39,7 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
 
     for _ in range(made.task.horizon):
         flags = is_placed(moves)
-        past = history(
-            np.array(corners, np.float32).reshape(1, -1, layout.corner_count, 2),
-            np.array(actions, np.float32).reshape(1, -1, made.task.action_size),
-        )
-        action = acting.explore(corners[-1][None], flags[None], goal[None], [rng], past)[0]
+        action = acting.explore(corners[-1][None], flags[None], goal[None], [rng])[0]
         token = 0
         if layout.tokens > 1:
             token = min(int((action[0] + 1.0) / 2.0 * layout.tokens), layout.tokens - 1)

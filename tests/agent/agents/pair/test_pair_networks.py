@@ -28,7 +28,7 @@ PARALLELOGRAM = 6
 
 
 def networks(kind: str, seed: int = 0) -> Networks:
-    made = Networks(LAYOUT, 2.0, seven(net=NETS[kind]).agent.net, motion=False)
+    made = Networks(LAYOUT, 2.0, seven(net=NETS[kind]).agent.net)
     initialise(made, torch.Generator().manual_seed(seed))
     return made.requires_grad_(False)
 
@@ -114,7 +114,7 @@ def test_the_critic_knows_how_much_is_covered_and_which_side_it_is(kind: str) ->
 
 def test_a_turn_of_pairs_is_atan2_over_k() -> None:
     layout = setup().task.layout
-    made = Networks(layout, 2.0, setup().agent.net, motion=False)
+    made = Networks(layout, 2.0, setup().agent.net)
     pairs = random_pairs(layout, 0)
     velocity, raw = made.actor(pairs)
     outputs = made.actor.head(pairs)

@@ -44,7 +44,7 @@ def scenes(made: Setup, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, 
 
 
 def random_networks(made: Setup, seed: int = 0) -> Networks:
-    networks = Networks(made.task.layout, made.task.sim.arena, made.agent.net, motion=False)
+    networks = Networks(made.task.layout, made.task.sim.arena, made.agent.net)
     initialise(networks, torch.Generator().manual_seed(seed))
     return networks.requires_grad_(False)
 
