@@ -86,7 +86,7 @@ def test_the_same_pictures_give_the_same_episodes(
     whole = played(task, policy)
     noise, shown = np.random.default_rng(9), iter(tape)
     monkeypatch.setattr(BatchedEnv, "_picture", lambda *of: [take(*of), next(shown)][1])
-    monkeypatch.setattr(BatchedEnv, "_covered", lambda env, _: noise.uniform(0, 1, env.count))
+    monkeypatch.setattr(BatchedEnv, "_covered", lambda env, *_: noise.uniform(0, 1, env.count))
     poses = KinematicWorld.poses
     lie = lambda world: poses(world) + noise.normal(0, 1, poses(world).shape)  # noqa: E731
     monkeypatch.setattr(KinematicWorld, "poses", lie)

@@ -97,7 +97,6 @@ class Planner:
 
     def __init__(self, networks: Networks, task: Place, reapply: int) -> None:
         self._networks, self._layout, self._reapply = networks, task.layout, reapply
-        self._sim = task.sim
         self._graph = PairGraph(task.layout, task.sim.arena)
         self._turns_over = task.layout.chiral & task.sim.allow_flip
 
