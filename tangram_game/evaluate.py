@@ -40,7 +40,7 @@ from tangram_tasks.played import Played
 from worker.score.test_set import FixedTests
 
 MAX_PICTURES = 100  # on a sheet
-MAX_PADDED = 5  # policies in a table
+MAX_PADDED = 4  # policies in a table
 MAX_LINES = 40  # of puzzles and of faults on the screen
 
 # What is shown beside the scores that a task declares; the rest is only in the file.

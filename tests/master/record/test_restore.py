@@ -191,7 +191,7 @@ def test_another_task_is_refused_before_anything_is_read_but_what_is_there(tmp_p
 def test_networks_that_would_mean_something_else_are_not_gone_on_with() -> None:
     made, other = (seven({}, PERCEPTRON, arena=arena) for arena in (2.0, 3.0))
     check_same_task(made, made.contents())
-    with pytest.raises(RunError, match="other settings of sim.arena: resume it with its own"):
+    with pytest.raises(RunError, match="other settings of sim: resume it with its own"):
         check_same_task(other, made.contents())
 
 
