@@ -93,6 +93,20 @@ GOAL: Config = {
 }
 SAC = over(GOAL, agent={"algorithm": "sac"})
 
+PUSH: Config = {
+    "task": {"kind": "push"},
+    "tokens": {"shapes": ["square", "small_triangle"], "scale": 1.1},
+    "agent": {
+        "kind": "push",
+        "width": 8,
+        "batch_size": 64,
+        "learning_starts": 8,
+        "replay_capacity": 256,
+        "updates_per_transition": 0.1,
+        "looked_at": 8,
+    },
+}
+
 # Setting -> a run in which it has an effect, and another value.
 SHOWS: dict[str, tuple[Config, object]] = {
     "tokens.shapes": (ONE, ["square"]),
@@ -144,6 +158,20 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.actor_delay": (GOAL, 1),
     "agent.smoothing": (GOAL, 0.4),
     "agent.entropy": (SAC, 0.5),
+    "agent.width": (PUSH, 9),
+    "agent.looked_at": (PUSH, 64),
+    "agent.targets_looked_at": (PUSH, 2),
+    "agent.some_share": (PUSH, 1.0),
+    "task.count": (PUSH, 1),
+    "task.within": (PUSH, 0.5),
+    "task.turned": (over(PUSH, task={"within": 0.5}), 3.0),
+    "task.finger": (PUSH, 0.1),
+    "task.longest": (PUSH, 1.0),
+    "task.friction": (PUSH, "fixed"),
+    "task.table_friction": (PUSH, [0.1, 0.2]),
+    "task.spread": (PUSH, [4.0, 5.0]),
+    "task.finger_friction": (PUSH, [1.0, 2.0]),
+    "task.centre": (PUSH, 0.5),
     "agent.hindsight": (ONE, [{"strategy": "final"}]),
     "agent.hindsight.strategy": (FINAL_TWICE, "future"),
     "agent.hindsight.copies": (NEAR_ONE, 2),

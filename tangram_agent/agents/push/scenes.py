@@ -77,7 +77,7 @@ class Tokens:
     def scene(self, corners: Array, goals: Array) -> Scene:
         """Of corners (n, V, 2): those on the table first."""
         there = on_table(goals, self._layout)
-        which = np.argsort(~there, axis=1, kind="stable")[:, : self.count]
+        which = np.argsort(~there, axis=1, kind="stable")[:, : self.count].copy()
         present = torch.from_numpy(np.take_along_axis(there, which, 1)).to(self._place)
         tokens = torch.from_numpy(which).to(self._place)
         return Scene(self.poses(corners, tokens), self.poses(goals, tokens), tokens, present)
