@@ -119,8 +119,9 @@ class Tokens:
         """(..., C, 2) outlines of tokens at poses (..., 3)."""
         # A product of matrices: a compiler would unroll sums of two into every corner's use.
         cos, sin = torch.cos(poses[..., 2]), torch.sin(poses[..., 2])
-        turns = torch.stack([cos, sin, -sin, cos], dim=-1).unflatten(-1, (2, 2))
-        return self.outlines[which] @ turns + poses[..., None, :2]
+        turns = torch.stack([torch.stack(one, dim=-1) for one in ((cos, sin), (-sin, cos))], dim=-2)
+        laid: Tensor = self.outlines[which] @ turns + poses[..., None, :2]
+        return laid
 
 
 def rotated(vectors: Tensor, angles: Tensor) -> Tensor:
