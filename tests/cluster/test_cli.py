@@ -67,7 +67,7 @@ def test_help_config_and_version_are_shown_and_leave_nothing_behind(
     assert [line.split()[0] for line in examples.strip().splitlines()] == [command] * 3
     if command in TRAINING:
         assert (
-            "  agent    goal, mlp, outline, paper, push, quick, tangram*, or path/to/file.py"
+            "  agent    goal, goal_large, mlp, outline, paper, push, quick, tangram*, or path/to/file.py"
             in text
         )
         for group in ("tokens", "sim", "reward", "net", "service"):
