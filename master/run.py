@@ -249,9 +249,9 @@ def _make_trainer(
         if config.warm_start is not None:
             warm_start(Path(config.warm_start), trainer)
     if service.compile:
-        log.info("compiles its update: up to a minute at first, seconds once it was compiled here")
-    trainer.learner.prepare()
-    watchdog.progress()
+        log.info("compiles its update: minutes at first, seconds once it was compiled here")
+    with watchdog.patient():
+        trainer.learner.prepare()
     return trainer, found
 
 

@@ -60,12 +60,16 @@ class Adam:
         """
         steps, means, squares = (self.slots[name] for name in NAMES)
         if traced:
-            for one in zip(self._parameters, gradients, means, squares, steps, strict=True):
-                _told(*one, torch.as_tensor(rate))
+            for step in steps:
+                step.add_(1.0)
+            # 1 - beta^t, without the digits that it loses while t is small.
+            whole, square = (-torch.expm1(math.log(beta) * steps[0]) for beta in BETAS)
+            for one in zip(self._parameters, gradients, means, squares, strict=True):
+                _told(*one, rate / whole, square)
             return
         adam(
             self._parameters,
-            list(gradients),
+            [one.contiguous() for one in gradients],  # it reads memory as it lies
             means,
             squares,
             max_exp_avg_sqs=[],
@@ -82,12 +86,9 @@ class Adam:
 
 
 def _told(
-    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: Tensor, rate: Tensor
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, rate: Tensor, whole: Tensor
 ) -> None:
     """The step of one parameter (Kingma and Ba 2014, algorithm 1)."""
-    step.add_(1.0)
     mean.lerp_(gradient, 1.0 - BETAS[0])
     square.lerp_(gradient * gradient, 1.0 - BETAS[1])
-    # 1 - beta^t, without the digits that it loses while t is small.
-    whole, whole_square = (-torch.expm1(math.log(beta) * step) for beta in BETAS)
-    parameter.sub_(rate / whole * mean / ((square / whole_square).sqrt() + EPSILON))
+    parameter.sub_(rate * mean / ((square / whole).sqrt() + EPSILON))

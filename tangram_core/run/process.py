@@ -110,6 +110,7 @@ def _wait(handle: int, on_line: Callable[[str], None] | None, grace_s: float) ->
 
 
 WATCHDOG_S = 300.0  # without progress: longer than a large checkpoint on a slow disk
+PATIENT_S = 3600.0  # where a compiler runs: minutes for a large update on a busy machine
 
 
 class Watchdog:
@@ -136,10 +137,17 @@ class Watchdog:
         if self._seconds and time.monotonic() - self._wound_s >= WIND_S:
             self._wind()
 
-    def _wind(self) -> None:
+    @contextmanager
+    def patient(self, seconds: float = PATIENT_S) -> Iterator[None]:
+        """What is done within may take so long without progress."""
+        self._wind(seconds)
+        yield
+        self._wind()
+
+    def _wind(self, seconds: float | None = None) -> None:
         if self._seconds:
             self._wound_s = time.monotonic()
-            faulthandler.dump_traceback_later(self._seconds, exit=True, file=STDERR)
+            faulthandler.dump_traceback_later(seconds or self._seconds, exit=True, file=STDERR)
 
 
 @contextmanager

@@ -87,8 +87,8 @@ class ServiceConfig(Settings, section="service"):
     )
     compile: bool = setting(
         False,
-        "whether an update is compiled as a whole: up to a minute at first and seconds later, then "
-        "an update is 1.1 to 2.5 times as fast; needs g++ or clang++. On a GPU it is recorded in "
+        "whether an update is compiled as a whole: minutes at first and seconds later, then an "
+        "update is 1.1 to 2.5 times as fast; needs g++ or clang++. On a GPU it is recorded in "
         "any case",
     )
 

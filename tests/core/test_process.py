@@ -137,6 +137,8 @@ def hang_here():
 with Watchdog(0.0) as off:
     off.progress()
 with Watchdog(0.5) as dog:
+    with dog.patient(30.0):
+        time.sleep(0.8)
     for _ in range({steps}):
         dog._wound_s = 0.0  # each call counts
         dog.progress()

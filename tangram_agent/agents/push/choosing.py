@@ -39,12 +39,11 @@ def best(
         tokens, seen, tokens.begins[own, which], tokens.ends[own, which], moved[own, which]
     )
     never = never | ~scene.present.flatten()[:, None]
-    first, second = critics.each
-    values = torch.where(never, _NEVER, first(seen, numbers)).view(size, -1)
+    values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
     value, at = values.max(1)
     slot, push = at // count, at % count
     row = rows * each + slot
-    other = second(_only(seen, row), numbers[row, push][:, None])[:, 0]
+    other = critics.one(1, _only(seen, row), numbers[row, push][:, None])[:, 0]
     return torch.minimum(value, other), slot, which[row, push]
 
 

@@ -210,7 +210,7 @@ class PushLearner(NetworkLearner):
         moved = moved.detach()
         with torch.no_grad():
             numbers, _ = pushes(tokens, view, begin[:, None], end[:, None], moved[:, None])
-        values = torch.stack([one(view, numbers)[:, 0] for one in self.critic.each])
+        values = self.critic(view, numbers)[..., 0]
         error = (values - target).square().mean(1).sum()
         yield Loss("critic", error, {"q": values.mean()})
 

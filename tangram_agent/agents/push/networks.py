@@ -3,8 +3,11 @@
 Legend: n rows, F, G numbers of a token and of another one, K tokens, N pushes, W width.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
 
 from tangram_agent.agents.push.scenes import PUSHES, Tokens
 from tangram_agent.agents.push.seen import PUSH, Seen, other_numbers, token_numbers
@@ -36,11 +39,32 @@ class Critic(nn.Module):
 
 
 class Twins(nn.Module):
-    """Two critics, of which the lesser counts (Fujimoto et al. 2018)."""
+    """Two critics, of which the lesser counts (Fujimoto et al. 2018).
+
+    Their weights lie one behind the other, so both are computed in one go.
+    """
 
     def __init__(self, corners: int, width: int) -> None:
         super().__init__()
-        self.each = nn.ModuleList(Critic(corners, width) for _ in range(2))
+        both, _ = stack_module_state([Critic(corners, width) for _ in range(2)])
+        self._names = list(both)
+        self.weights = nn.ParameterList(both.values())
+        with torch.device("meta"):
+            self._form = [Critic(corners, width)]  # a list: no part of this module
+
+    def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
+        """(2, n, N) of pushes (n, N, 18)."""
+        values: Tensor = vmap(lambda *own: self._value(own, seen, pushes))(*self.weights)
+        return values
+
+    def one(self, which: int, seen: Seen, pushes: Tensor) -> Tensor:
+        """(n, N) of one of them."""
+        return self._value([both[which] for both in self.weights], seen, pushes)
+
+    def _value(self, weights: Sequence[Tensor], seen: Seen, pushes: Tensor) -> Tensor:
+        own = dict(zip(self._names, weights, strict=True))
+        values: Tensor = functional_call(self._form[0], own, (seen, pushes))
+        return values
 
 
 class Alone(nn.Module):

@@ -102,7 +102,7 @@ def test_what_is_seen_hangs_on_no_frame_but_the_tokens_own() -> None:
 
 def test_a_token_that_is_not_there_is_not_seen() -> None:
     tokens, agent = Tokens(SOME, CPU), Pushing(SMALL)
-    critic = agent.learner(SOME, 0, "cpu").critic.each[0]  # type: ignore[attr-defined]
+    critic = agent.learner(SOME, 0, "cpu").critic  # type: ignore[attr-defined]
     found = scene(SOME, 4)
     gone = replace(found, present=torch.tensor([[True, True, False]]).expand(4, 3))
     poses = gone.poses.clone()
