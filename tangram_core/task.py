@@ -4,7 +4,7 @@ Legend: E episodes, B environments, T steps of an episode, A entries of an actio
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, Literal, Self
 
@@ -127,7 +127,7 @@ class Task(ABC):
     `make` does, and only a worker calls it. So nothing heavy is imported at the top of its file.
 
     What must be there: `spec`, `scores`, `rewards`, `make` and `score`. What may: `check`,
-    `check_exact`, `ended`, `rivals` and `draw`.
+    `check_exact`, `ended`, `rivals`, `draw`, `film` and `plan`.
 
     **Goals.** Two fields of the spec hold goals of the same shape: what is achieved at each moment,
     and what is desired in an episode. Hindsight asks `rewards` what the same step would have been
@@ -200,6 +200,14 @@ class Task(ABC):
 
     def draw(self, played: Played) -> Pixels | None:  # noqa: ARG002
         """A picture (H, W, 3) of a few test episodes; None: there is none to be drawn."""
+        return None
+
+    def film(self, played: Played) -> Iterable[Pixels] | None:  # noqa: ARG002
+        """Pictures (H, W, 3) of test episodes, one after the other; None: there are none."""
+        return None
+
+    def plan(self, played: Played) -> Json | None:  # noqa: ARG002
+        """The first test episode as data, for a machine that does the same; None: there is none."""
         return None
 
     def pinned(self) -> Self:

@@ -4,8 +4,9 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 instant.
 """
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from conf.cli import entry, tell
 from conf.commands import Plain
@@ -13,6 +14,8 @@ from conf.commands import Plain
 if TYPE_CHECKING:
     from tangram_agent.runs import Run
     from tangram_game.config import EvalConfig, PlayConfig
+
+    Config = TypeVar("Config", EvalConfig, PlayConfig)
 
 
 def evaluate() -> int:
@@ -30,7 +33,7 @@ def _evaluate(settings: Plain) -> int:
     from tangram_core.store.files import check_writable
     from tangram_game.config import EvalConfig
 
-    config = from_mapping(EvalConfig, with_changes(with_absolute_paths(settings)))
+    config = _with_figures(from_mapping(EvalConfig, with_changes(with_absolute_paths(settings))))
     for name, path in (("out", config.out), ("sheet", config.sheet)):
         if path is not None:
             check_writable(name, Path(path))
@@ -48,7 +51,7 @@ def _play(settings: Plain) -> int:
     from tangram_game.config import PlayConfig
 
     paths = with_absolute_paths(settings)
-    config = from_mapping(PlayConfig, with_changes(paths))
+    config = _with_figures(from_mapping(PlayConfig, with_changes(paths)))
     check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
     stored = _check_played(config)
@@ -66,6 +69,22 @@ def _play(settings: Plain) -> int:
     from tangram_game.play import play_run
 
     return play_run(config, filled)
+
+
+def _with_figures(config: "Config") -> "Config":
+    """Puzzles are a setting of a task of pushes."""
+    from tangram_agent.runs import read_changed
+    from tangram_game.config import is_puzzle_source
+    from tangram_tasks.push.task import Push
+
+    if config.puzzle is None:
+        return config
+    changes = config.changes
+    if not isinstance(read_changed(config.run, changes).setup.task, Push):
+        return config
+    own = changes.get("task", {}) | {"puzzle": list(config.puzzle)}
+    shown = config.episodes if is_puzzle_source(config.puzzle[0]) else len(config.puzzle)
+    return replace(config, puzzle=None, episodes=shown, changes=changes | {"task": own})
 
 
 def _check_played(config: "EvalConfig | PlayConfig") -> "Run":

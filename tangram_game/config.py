@@ -21,6 +21,8 @@ MAX_TURNS = 360
 MAX_SOLUTIONS = 20
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
 PICTURES = (".gif", ".mp4", ".png")
+PLAN = ".json"
+WRITTEN = (*PICTURES, PLAN)
 MAX_SEED = 2**63 - 1
 PUZZLE_FILES = (".json", ".svg")
 PUZZLE_HELP = (
@@ -158,7 +160,10 @@ class PlayConfig(Settings):
     run_dir: str | None = setting(
         None, "folder of the run, or an agent that comes with tangram-rl: pretrained/square"
     )
-    out: str = setting("play.gif", ".gif or .mp4 for an animation, .png for one picture")
+    out: str = setting(
+        "play.gif",
+        ".gif or .mp4 for an animation, .png for one picture, .json for a finger's way points",
+    )
     episodes: int = setting(
         12,
         "episodes shown side by side",
@@ -193,9 +198,9 @@ class PlayConfig(Settings):
     def __post_init__(self) -> None:
         figures = (self.puzzle, self.target, self.silhouette)
         _check_run(self.run_dir, figures != (None, None, None))
-        if Path(self.out).suffix not in PICTURES:
+        if Path(self.out).suffix not in WRITTEN:
             raise ConfigError(
-                f"out must end with {', '.join(PICTURES)}, got '{self.out}': .gif and .mp4 move, "
+                f"out must end with {', '.join(WRITTEN)}, got '{self.out}': .gif and .mp4 move, "
                 ".png shows the ends"
             )
         if Path(self.out).suffix == ".mp4" and find_spec("av") is None:

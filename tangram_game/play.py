@@ -1,5 +1,6 @@
 """tangram-play: episodes of finished runs as an animation or as one picture."""
 
+import json
 import math
 from collections.abc import Sequence
 from contextlib import closing
@@ -62,27 +63,38 @@ def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
     figures = (config.puzzle, config.target, config.silhouette)
     if isinstance(run.setup.task, Place) or figures != (None, None, None):
         show = make_show(run, config, silhouette)
-        frames, line = _frames(show, config.out), show.told()
+        line = show.told()
+        save_picture(config.out, _frames(show, config.out))
     else:
-        frames, line = [_drawn(run, config)], plural(config.episodes, "episode")
-    save_picture(config.out, frames)
+        line = _shown(run, config)
     Console(highlight=False).print(f"{config.out}: {line}", markup=False, soft_wrap=True)
     return 0
 
 
-def _drawn(run: Run, config: PlayConfig) -> Image.Image:
-    """Episodes of a task that is not of tokens, as it draws them itself."""
-    task = run.setup.task
+def _shown(run: Run, config: PlayConfig) -> str:
+    """Write what a task that is not of tokens makes of its episodes; returns what to tell."""
+    task, kind = run.setup.task, Path(config.out).suffix
+    count = 1 if kind == ".json" else config.episodes
     with closing(
-        FixedTests(task, config.episodes, run.actor.at_once, role="play", seed=config.seed)
+        FixedTests(task, count, run.actor.at_once, role="play", seed=config.seed)
     ) as tests:
-        picture = task.draw(tests.play(greedy(run.actor)))
-    if picture is None:
+        played = tests.play(greedy(run.actor))
+    if kind == ".json":
+        plan = task.plan(played)
+        if plan is not None:
+            write_whole(Path(config.out), (json.dumps(plan, indent=1) + "\n").encode())
+            return plural(count, "episode")
+        raise ConfigError(f"task={run.setup.task_kind} makes no plan: set out=play.png")
+    film = None if kind == ".png" else task.film(played)
+    picture = task.draw(played) if film is None else None
+    frames = [] if picture is None else [picture]
+    if film is None and not frames:
         raise ConfigError(
             f"{run.folder} plays task={run.setup.task_kind}, which draws no pictures: "
             f"tangram-eval run_dir={run.folder} scores it"
         )
-    return Image.fromarray(picture)
+    save_picture(config.out, [Image.fromarray(one) for one in film or frames])
+    return plural(count, "episode")
 
 
 def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> Show:

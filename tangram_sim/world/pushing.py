@@ -13,6 +13,7 @@ Lengths are arena units, in which the table is 2 wide. Legend: K tokens.
 
 import math
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ from tangram_sim.world.engine import pybullet
 _WALL = 0.25
 _MARGIN = 1e-3  # of what collides, which is smaller by it on every side
 _STEP = 1.0 / 120.0  # way of the finger in one step
+_LEAST = 1e-6  # way that is worth a step
 _ITERATIONS = 20  # of the engine's solver; 50 are its default
 _STIFF = 1e4  # inertia about x and y, far more than a token's: none tips over
 _FORCE = 1e4  # of the finger's motors: nothing that is pushed slows it down
@@ -102,21 +104,36 @@ class PushTable:
 
     def push(self, begin: Floats, way: Floats) -> None:
         """Bring the finger down at `begin` (2,), move it by `way` (2,), not none, and lift it."""
-        length = math.hypot(*way)
-        steps = max(1, math.ceil(length / _STEP))
-        # First: what a motor can do hangs on the step's length.
-        self._call("setPhysicsEngineParameter", fixedTimeStep=length, numSubSteps=steps)
-        self._finger_at(begin[0], begin[1], 0.0)
-        self._call(  # a unit in a second
-            "setJointMotorControlArray",
-            self._pusher,
-            (0, 1, 2),
-            pybullet.VELOCITY_CONTROL,
-            targetVelocities=(way[0] / length, way[1] / length, 0.0),
-            forces=(_FORCE, _FORCE, _FORCE),
-        )
-        self._call("stepSimulation")
-        self._finger_at(begin[0], begin[1], _ABOVE)
+        for _ in self.follow(np.stack([begin, begin + way])):
+            pass
+
+    def follow(self, path: Floats) -> Iterator[int]:
+        """The same along points (n, 2), step by step; yields the number of one where it is there.
+
+        Points within a step of the one before are left out, but for the last.
+        """
+        self._finger_at(path[0], 0.0)
+        at, last = path[0], len(path) - 1
+        for number, there in enumerate(path[1:], 1):
+            way = there - at
+            length = math.hypot(*way)
+            if length < (_STEP if number < last else _LEAST):
+                continue
+            at = there
+            steps = max(1, math.ceil(length / _STEP - 1e-6))
+            # First: what a motor can do hangs on the step's length.
+            self._call("setPhysicsEngineParameter", fixedTimeStep=length, numSubSteps=steps)
+            self._call(  # a unit in a second
+                "setJointMotorControlArray",
+                self._pusher,
+                (0, 1, 2),
+                pybullet.VELOCITY_CONTROL,
+                targetVelocities=(way[0] / length, way[1] / length, 0.0),
+                forces=(_FORCE, _FORCE, _FORCE),
+            )
+            self._call("stepSimulation")
+            yield number
+        self._finger_at(path[-1], _ABOVE)
         for token in self._bodies:
             self._put(token, self._pose(token))
 
@@ -134,8 +151,8 @@ class PushTable:
     def _call(self, name: str, *given: Any, **named: Any) -> Any:
         return getattr(pybullet, name)(*given, **named, physicsClientId=self._client)
 
-    def _finger_at(self, x: float, y: float, height: float) -> None:
-        for joint, value in enumerate((x, y, height)):
+    def _finger_at(self, place: Floats, height: float) -> None:
+        for joint, value in enumerate((*place.tolist(), height)):
             self._call("resetJointState", self._pusher, joint, value, 0.0)
 
     def _put(self, token: int, pose: Floats) -> None:

@@ -3,6 +3,7 @@
 Legend: B environments, K tokens, V corners.
 """
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Env, Generators, Step
+from tangram_sim.world.arm import METRES, Panda
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.places import AWAY, begin, push_of
 
@@ -29,6 +31,7 @@ class PushEnv(Env):
         """Set up the tables."""
         self.count, self._task = count, task
         self.tables = [PushTable(task.layout, task.config.finger) for _ in range(count)]
+        self.arms = [Panda() for _ in range(count if task.config.hand == "panda" else 0)]
         shape = (count, task.layout.corner_count, 2)
         self.corners: Floats = np.full(shape, AWAY)
         self.goals: Floats = np.full(shape, AWAY)
@@ -40,12 +43,14 @@ class PushEnv(Env):
         """Lay out an episode on every table."""
         layout = self._task.layout
         for b, rng in enumerate(generators):
-            tokens, starts, goals = begin(layout, self._task.count, rng)
+            tokens, starts, goals = begin(layout, self._task.count, rng, self._task.figures)
             present, every, desired = self._present[b], *np.zeros((2, layout.tokens, 3))
             present[:] = False
             present[tokens], every[tokens], desired[tokens] = True, starts, goals
             self.unknowns[b] = self._drawn(rng)
             self.tables[b].place(every, present, self.unknowns[b])
+            for arm in self.arms[b : b + 1]:
+                arm.home()
             self.goals[b] = self.corners_of(desired, present)
             self.corners[b] = self.corners_of(every, present)
         self.refused, self._ended = [""] * self.count, np.zeros(self.count, np.bool_)
@@ -58,9 +63,8 @@ class PushEnv(Env):
         for b in np.flatnonzero(~self._ended).tolist():
             action = actions[b]
             push = push_of(layout, self.corners[b], action, config.finger, config.longest)
-            self.refused[b] = push.refused
-            if not push.refused:
-                self.tables[b].push(push.begin, push.way)
+            self.refused[b] = push.refused or self._push(b, push.begin, push.way)
+            if not self.refused[b]:
                 self.corners[b] = self.corners_of(self.tables[b].poses(), self._present[b])
         # As the master has them, which comes to the same reward.
         corners, goals = self.corners.astype(np.float32), self.goals.astype(np.float32)
@@ -69,9 +73,22 @@ class PushEnv(Env):
         self._ended = np.asarray(placed.all(axis=1))
         return Step(self._seen(), rewards, self._ended.copy())
 
+    def _push(self, b: int, begin: Floats, way: Floats) -> str:
+        """Push on a table; why an arm could not."""
+        path = np.stack([begin, begin + way])
+        for arm in self.arms[b : b + 1]:
+            motion = arm.push(begin * METRES, way * METRES)
+            if motion is None:
+                return "the arm does not get there"
+            path = motion.pushed / METRES
+        for _ in self.tables[b].follow(path):
+            pass
+        return ""
+
     def facts(self) -> Arrays:
-        """Exact corners and goals, and whether the last push was refused."""
-        return {
+        """Exact corners and goals, whether the last push was refused, and what nobody is told."""
+        unknowns = [asdict(one) for one in self.unknowns]
+        return {name: np.array([one[name] for one in unknowns]) for name in unknowns[0]} | {
             "corners": self.corners.copy(),
             "goals": self.goals.copy(),
             "refused": np.array([bool(why) for why in self.refused]),
@@ -81,6 +98,8 @@ class PushEnv(Env):
         """End the engine's clients."""
         for table in self.tables:
             table.close()
+        for arm in self.arms:
+            arm.close()
 
     @property
     def middle(self) -> Unknowns:

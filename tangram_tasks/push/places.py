@@ -3,17 +3,19 @@
 Legend: n rows, K tokens, V corners.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from tangram_core.arrays import AnyArray, Bools, Floats, Ints
-from tangram_core.errors import SamplingError
+from tangram_core.errors import ConfigError, SamplingError
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
+from tangram_sim.puzzles.figures import SPLITS, library
 from tangram_sim.targets.sampling import sample_batch
-from tangram_sim.targets.targets import has_all_tans, sample_targets
+from tangram_sim.targets.targets import has_all_tans, placement, sample_targets, turned_figure
 
 ARENA = 2.0  # width of the table
 AWAY = 3.0  # x and y of all corners of a token that is not on the table
@@ -126,11 +128,13 @@ def _distances(layout: Layout, corners: Floats, point: Floats) -> Floats:
     return found
 
 
-def begin(layout: Layout, count: int, rng: np.random.Generator) -> tuple[Ints, Floats, Floats]:
+def begin(
+    layout: Layout, count: int, rng: np.random.Generator, figures: Sequence[Floats] = ()
+) -> tuple[Ints, Floats, Floats]:
     """Which tokens an episode has, (count,), and poses (count, 3) of their start and their goal.
 
     One goes anywhere; several go where they touch edge to edge, all seven tans also into figures
-    that people know. They start apart.
+    that people know, or all of them into one of the figures (K, 3). They start apart.
 
     Raises:
         SamplingError: no room.
@@ -140,16 +144,43 @@ def begin(layout: Layout, count: int, rng: np.random.Generator) -> tuple[Ints, F
     kind = "touching" if has_all_tans(own) else "connected" if count > 1 else "uniform"
     sim = SimConfig(arena=ARENA, targets=kind)
     try:
-        goals, flipped = sample_targets(own, sim, [rng])
-        while flipped.any():  # a figure of which a token lies on its other side: no push turns it
-            goals, flipped = sample_targets(own, sim, [rng])
+        if figures:
+            unturned = figures[int(rng.integers(len(figures)))], np.zeros(count, np.bool_)
+            goals = turned_figure(own, unturned, rng.uniform(-np.pi, np.pi))
+        else:
+            (goals,), (flipped,) = sample_targets(own, sim, [rng])
+            if flipped.any():  # no push turns a token over
+                goals, _ = own.mirrored(goals, flipped)
         starts = sample_batch(own, sim, [rng])
     except SamplingError:
         raise SamplingError(
             f"no room for {', '.join(shape.name for shape in own.shapes)} on a table of width "
             f"{ARENA:g}: lower tokens.scale"
         ) from None
-    return tokens, starts[0], goals[0]
+    return tokens, starts[0], goals
+
+
+def figures_of(layout: Layout, scale: float, named: Sequence[str]) -> Iterator[Floats]:
+    """Poses (K, 3) of the tokens in figures of the library, mirrored where one would lie flipped.
+
+    Raises:
+        ConfigError: there is no such figure, it has other pieces, or the table is too small.
+    """
+    known = {split: library(split, scale) for split in SPLITS}
+    known |= {one.name: (one,) for split in SPLITS for one in known[split]}
+    for name in named:
+        if name not in known:
+            raise ConfigError(f"no puzzle '{name}': choose from {', '.join(known)}")
+        for one in known[name]:
+            poses, flipped = placement(one, layout)
+            poses = layout.mirrored(poses, flipped)[0] if flipped.any() else poses
+            reach = float(np.linalg.norm(layout.corners(poses), axis=1).max())
+            if reach > ARENA / 2.0:
+                raise ConfigError(
+                    f"puzzle '{one.name}' reaches {reach:.2f} from its middle and the table "
+                    f"{ARENA / 2.0:g}: lower tokens.scale"
+                )
+            yield poses
 
 
 @lru_cache(maxsize=256)

@@ -3,7 +3,7 @@
 Legend: E episodes, T pushes of an episode, K tokens, V corners, n rows.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
@@ -18,7 +18,7 @@ from tangram_core.settings import NETWORK, Settings, setting
 from tangram_core.spec import Array, EpisodeSpec, Field
 from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
-from tangram_tasks.push.places import ARENA, begin, errors, on_table
+from tangram_tasks.push.places import ARENA, begin, errors, figures_of, on_table
 
 if TYPE_CHECKING:
     from tangram_tasks.push.env import PushEnv
@@ -39,9 +39,19 @@ class PushConfig(Settings, section="task"):
         high=16,
         part=NETWORK,
     )
+    puzzle: tuple[str, ...] = setting(
+        (),
+        "figures that the seven tans are to make, at any angle, by name, or train, test or paper, "
+        "all of the library's; none: tokens touch as chance has it, or as figures of train do",
+    )
     within: float = setting(0.03, "distance at which a token is in its place", low=1e-4, high=1)
     turned: float = setting(0.1, "turn within which it is", low=1e-4, high=4, unit="rad")
     finger: float = setting(0.04, "the finger's radius", low=0.005, high=0.2)
+    hand: str = setting(
+        "finger",
+        "finger: it goes wherever it should; panda: a robot's arm holds it, as joints allow",
+        choices=("finger", "panda"),
+    )
     longest: float = setting(0.5, "way of the longest push", low=0.05, high=2)
     friction: str = setting(
         "drawn",
@@ -118,6 +128,20 @@ class Push(Task):
         """Tokens of an episode."""
         return self.config.count or self.layout.tokens
 
+    @cached_property
+    def figures(self) -> tuple[Floats, ...]:
+        """Poses (K, 3) of the tokens in each figure that they are to make.
+
+        Raises:
+            ConfigError: there is no such figure, or it has other pieces.
+        """
+        named = self.config.puzzle
+        if named and self.count < self.layout.tokens:
+            raise ConfigError(
+                f"task.puzzle needs all tokens, got task.count={self.count}: set it 0"
+            )
+        return tuple(figures_of(self.layout, self.tokens.scale, named))
+
     @property
     def spec(self) -> EpisodeSpec:
         """Corners of all tokens, and where they should come; AWAY where one is not there."""
@@ -152,7 +176,7 @@ class Push(Task):
 
     def check(self, *, plays: bool) -> None:
         """Refuse tokens that have no room, and to play where there is no engine."""
-        begin(self.layout, self.count, np.random.default_rng(0))
+        begin(self.layout, self.count, np.random.default_rng(0), self.figures)
         if plays and find_spec("pybullet") is None:
             raise ConfigError("task=push needs PyBullet, which is missing: pip install pybullet")
 
@@ -197,6 +221,19 @@ class Push(Task):
         shares = self._covered(ends, goals)
         sheet = episode_sheet(self.layout, ARENA, starts, ends, goals, 4, PIXELS, shares)
         return np.asarray(sheet.convert("RGB"))
+
+    def film(self, played: Played) -> Iterator[Pixels]:
+        """The finger from above, or the arm that holds it."""
+        from tangram_tasks.push.film import from_above, from_the_side  # noqa: PLC0415
+
+        shown = from_the_side if self.config.hand == "panda" else from_above
+        return (np.asarray(one) for one in shown(self, played))
+
+    def plan(self, played: Played) -> Json:
+        """Way points of the finger."""
+        from tangram_tasks.push.plan import plan_of  # noqa: PLC0415
+
+        return plan_of(self, played)
 
     def _covered(self, corners: Floats, goals: Floats) -> Floats:
         """(n,) shares of the places that tokens with corners (n, V, 2) cover."""
