@@ -50,14 +50,15 @@ class PushActor(NetworkActor):
         with torch.no_grad():
             looked_at = self._config.looked_at
             moved = self.network.table.moved
-            found = best(self.network.critic, moved, tokens, scene, drawn, looked_at)
-        slots, pushes = (one.numpy().copy() for one in found[1:])
+            slots = torch.arange(self._task.count).expand(len(corners), -1)
+            found = best(self.network.critic, moved, tokens, scene, slots, drawn, looked_at)
+        chosen, pushes = (one.numpy().copy() for one in found[1:])
         if explore is not None:
             other = any_push[:, 0] < self._config.uniform_share
             count = scene.present.sum(1).numpy()
-            slots = np.where(other, (any_push[:, 1] * count).astype(np.int64), slots)
+            chosen = np.where(other, (any_push[:, 1] * count).astype(np.int64), chosen)
             pushes = np.where(other, (any_push[:, 2] * PUSHES).astype(np.int64), pushes)
-        which = scene.which.numpy()[np.arange(len(slots)), slots]
+        which = scene.which.numpy()[np.arange(len(chosen)), chosen]
         actions: Singles = tokens.actions[which, pushes].astype(np.float32)
         return actions
 

@@ -14,7 +14,13 @@ _NEVER = -1e3  # value of what cannot be done
 
 
 def best(
-    critics: Twins, moved: Tensor, tokens: Tokens, scene: Scene, drawn: Tensor, count: int
+    critics: Twins,
+    moved: Tensor,
+    tokens: Tokens,
+    scene: Scene,
+    slots: Tensor,
+    drawn: Tensor,
+    count: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The best push of each table: its value (n,), the slot of its token (n,), and which (n,).
 
@@ -25,26 +31,26 @@ def best(
         moved: (S, 1024, 3) what pushes do to tokens alone.
         tokens: the set.
         scene: n tables.
-        drawn: (n * K, P) numbers of pushes.
+        slots: (n, k) of the tokens that may be pushed.
+        drawn: (n * k, P) numbers of pushes.
         count: of pushes of each token that are looked at: the half after which least is left to go
             if it is alone, and the first that were drawn.
     """
-    size, each = scene.poses.shape[:2]
+    size, each = slots.shape
     rows = torch.arange(size, device=drawn.device)
-    slots = torch.arange(each, device=drawn.device).repeat(size)
-    seen = seen_by(tokens, scene.repeated(each), slots)
+    seen = seen_by(tokens, scene.repeated(each), slots.flatten())
     which = _looked_at(tokens, seen, moved, drawn, count)
     own = seen.which[:, None]
     numbers, never = pushes(
         tokens, seen, tokens.begins[own, which], tokens.ends[own, which], moved[own, which]
     )
-    never = never | ~scene.present.flatten()[:, None]
+    never = never | ~scene.present.gather(1, slots).flatten()[:, None]
     values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
     value, at = values.max(1)
     slot, push = at // count, at % count
     row = rows * each + slot
     other = critics.one(1, _only(seen, row), numbers[row, push][:, None])[:, 0]
-    return torch.minimum(value, other), slot, which[row, push]
+    return torch.minimum(value, other), slots[rows, slot], which[row, push]
 
 
 def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: int) -> Tensor:

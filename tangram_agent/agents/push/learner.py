@@ -30,6 +30,7 @@ from tangram_tasks.push.places import ways_of
 from tangram_tasks.push.task import Push
 
 _DRAWN = 96  # P: pushes of which those are taken that a target looks at
+_TOKENS = 3  # k: tokens whose pushes a target looks at, rather those that are not in place
 _RENEWED = 20  # updates after which the table of pushes is
 _LAST = 0.1  # share of the learning rate that is left at the end of a budget
 _STILL = 1e-4  # way of a token that did not move
@@ -45,7 +46,8 @@ class Batch:
         which, present: (B, K) see `Scene`.
         slots: (B,) of the token that was pushed.
         begins, ends: (B, 2) of the finger, on the table.
-        drawn: (B * K, P) pushes that may be the best that follows.
+        order: (B, K) random numbers in [0, 1).
+        drawn: (B * k, P) pushes that may be the best that follows.
     """
 
     poses: Tensor
@@ -56,6 +58,7 @@ class Batch:
     slots: Tensor
     begins: Tensor
     ends: Tensor
+    order: Tensor
     drawn: Tensor
 
     @property
@@ -171,7 +174,8 @@ class PushLearner(NetworkLearner):
         corners = before.astype(np.float64)
         pushed, begins, ways = ways_of(task.layout, corners, actions, finger, longest)
         scene = self._tokens.scene(before, desired)
-        size = (config.batch_size * task.count, _DRAWN)
+        order = rng["replay"].random((config.batch_size, task.count))
+        size = (config.batch_size * min(_TOKENS, task.count), _DRAWN)
         self.batch = batch = Batch(
             scene.poses,
             self._tokens.poses(following, scene.which),
@@ -181,6 +185,7 @@ class PushLearner(NetworkLearner):
             (scene.which == self.tensor(pushed, np.int64)[:, None]).int().argmax(1),
             self.tensor(begins),
             self.tensor(begins + ways),
+            self.tensor(order),
             self.tensor(rng["replay"].integers(PUSHES, size=size), np.int64),
         )
         return batch
@@ -191,10 +196,12 @@ class PushLearner(NetworkLearner):
         poses = torch.zeros(size, count, 3, device=self.place)
         which = torch.zeros(size, count, dtype=torch.int64, device=self.place)
         ways = torch.zeros(size, 2, device=self.place)
-        drawn = torch.zeros(size * count, _DRAWN, dtype=torch.int64, device=self.place)
+        drawn = torch.zeros(
+            size * min(_TOKENS, count), _DRAWN, dtype=torch.int64, device=self.place
+        )
         scene = poses, poses.clone(), poses.clone(), which, which == 0
         push = which[:, 0].clone(), ways, ways.clone()
-        yield Batch(*scene, *push, drawn)
+        yield Batch(*scene, *push, poses[..., 0].clone(), drawn)
 
     def losses(self, seen: Batch) -> Iterator[Loss]:
         """What pushes do to a token alone, and what they are worth."""
@@ -219,9 +226,11 @@ class PushLearner(NetworkLearner):
         tokens, config = self._tokens, self.config
         critic: Twins = self.targets["critic"]  # type: ignore[assignment]
         scene, count = seen.at(seen.following), config.targets_looked_at
-        value, _, _ = best(critic, self.table.moved, tokens, scene, seen.drawn, count)
-        least = -1.0 / (1.0 - config.gamma)
         placed = tokens.placed(scene)
+        first = seen.order + 2.0 * scene.present + (~placed & scene.present)
+        slots = first.topk(min(_TOKENS, first.shape[1]), dim=1).indices
+        value, _, _ = best(critic, self.table.moved, tokens, scene, slots, seen.drawn, count)
+        least = -1.0 / (1.0 - config.gamma)
         counts = scene.present.sum(1)
         reward = (placed & scene.present).sum(1) / counts - 1.0  # as the task pays it
         goes_on = ~(placed | ~scene.present).all(1)
