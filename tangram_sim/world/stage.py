@@ -17,7 +17,7 @@ from tangram_sim.world.arm import METRES, Panda
 from tangram_sim.world.engine import pybullet
 
 SIDE = (480, 300)  # pixels
-_CAMERA, _LOOKS_AT, _SIGHT = (0.32, -0.62, 0.5), (-0.06, 0.0, 0.1), 48.0
+_CAMERA, _LOOKS_AT, _SIGHT = (0.62, -0.5, 0.62), (-0.1, 0.0, 0.12), 46.0
 _THICK = 0.015  # metres, of a token
 _TABLE, _PLACE = (0.97, 0.97, 0.95), (0.86, 0.78, 0.62)
 

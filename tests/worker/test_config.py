@@ -54,7 +54,7 @@ WRONG = {
     PlayConfig: [
         *OF_A_RUN,
         *[
-            ({"out": out}, "out must end with .gif, .mp4, .png, got")
+            ({"out": out}, "out must end with .gif, .mp4, .png, .json, got")
             for out in ("film.webm", "film", "", "gif", "film.GIF.txt")
         ],
         ({"run_dir": None}, "say which run: run_dir=runs/..."),
