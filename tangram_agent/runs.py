@@ -107,7 +107,7 @@ class Run:
         """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
 
         Args:
-            observation: of `TangramEnv`, or of `TangramVectorEnv`: each entry with B rows.
+            observation: of `TangramEnv`, or of several: each entry with B rows then.
 
         Returns:
             (A,) in [-1, 1], which `step` takes; (B, A) for B rows.

@@ -36,7 +36,6 @@ for _name, _settings in KWARGS.items():
         gymnasium.register(
             id=_name,
             entry_point="tangram_sim.env:TangramEnv",
-            vector_entry_point="tangram_sim.vector:TangramVectorEnv",
             max_episode_steps=_settings["horizon"],
             kwargs=_settings,
         )
