@@ -1,16 +1,30 @@
 """TangramEnv: one tangram world as a gymnasium goal environment."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.spaces import Box, Dict
 
 from tangram_core.arrays import Floats, Pixels
 from tangram_core.errors import ConfigError
-from tangram_sim.config import RewardConfig
-from tangram_sim.table import SQUARE_SCALE, Observation, Table
+from tangram_core.settings import check_range
+from tangram_sim.batch import BatchedEnv, StepResult
+from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
+from tangram_sim.drawing.scenes import draw_scene
+from tangram_sim.geometry.layout import TokensConfig, make_layout
+from tangram_sim.motion.actions import chosen_tokens
+from tangram_sim.motion.actions import horizon as steps_of
+from tangram_sim.targets.targets import check_targets
+
+Observation = dict[str, Any]  # of float64 vectors
+
+MAX_SIDE = 4096  # of a picture, pixels
+# The square tan has a quarter of the full square's diagonal as its side: this makes it 0.4.
+SQUARE_SCALE = 0.8 * 2.0**0.5
 
 
 class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
@@ -63,32 +77,58 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         """
         check_render_mode(render_mode)
         self.render_mode = render_mode
-        self._table = Table(1, shapes, scale, reward, success_overlap, render_size, horizon, **sim)
-        self.batch = self._table.batch
-        self.layout, self.sim = self.batch.layout, self.batch.sim
-        self.action_space = self._table.action_space
-        self.observation_space = self._table.observation_space
+        self.layout = make_layout(TokensConfig(tuple(shapes), scale))
+        self.sim = _sim_config(sim)
+        check_targets(self.layout, self.sim)
+        check_range("success_overlap", success_overlap, 0.0, 1.0)
+        check_range("render_size", render_size, 1, MAX_SIDE)
+        steps = steps_of(self.layout.tokens, self.sim)
+        if horizon not in (None, steps):
+            raise ConfigError(
+                f"an episode of these settings has {steps} steps, and the id's time limit is "
+                f"{horizon}: give horizon={steps} and max_episode_steps={steps}, too, or keep to "
+                "the id's number of tokens and actions_per_token"
+            )
+        paid = reward if isinstance(reward, RewardConfig) else RewardConfig(name=reward)
+        self.batch = batch = BatchedEnv(self.layout, self.sim, paid, 1)
+        self._success_overlap, self._render_size = success_overlap, render_size
+        self._moved: int | None = None
+        self.action_space = Box(-1.0, 1.0, (batch.action_size,), np.float32)
+        goal = np.full(2 * self.layout.corner_count, batch.bound)
+        flags = np.ones(self.layout.tokens)
+        low, high = np.concatenate([-goal, 0.0 * flags]), np.concatenate([goal, flags])
+        self.observation_space = Dict(
+            {
+                "observation": Box(low, high, dtype=np.float64),
+                "achieved_goal": Box(-goal, goal, dtype=np.float64),
+                "desired_goal": Box(-goal, goal, dtype=np.float64),
+            }
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode; a seed fixes this one and all that follow; SamplingError: no room."""
         super().reset(seed=seed, options=options)
-        self._table.reset([self.np_random])
+        self.batch.reset([self.np_random])
+        self._moved = None
         return self._observation(), {}
 
     def step(
         self, action: npt.NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Play one action of shape (A,)."""
-        result = self._table.step(np.asarray(action, dtype=np.float64)[None])
-        terminated, truncated = self._table.ends(result)
+        given = np.asarray(action, dtype=np.float64)[None]
+        result = self.batch.step(given)
+        self._moved, placed = int(result.tokens[0]), bool(self.batch.placed.all())
+        named = int(chosen_tokens(given, self.layout.tokens)[0])
+        ended = bool(result.done)
         return (
             self._observation(),
             float(result.rewards[0]),
-            bool(terminated[0]),
-            bool(truncated[0]),
-            self._table.info(result, 0),
+            ended and placed,
+            ended and not placed,
+            self._info(result, named),
         )
 
     def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:  # noqa: ARG002 - goal environments have it
@@ -111,14 +151,49 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     def render(self) -> Pixels | None:
         """The scene as (size, size, 3), the last mover marked; None without a render mode."""
-        return None if self.render_mode is None else self._table.picture(0)
+        if self.render_mode is None:
+            return None
+        scene = (self.batch.corners[0], self.batch.goals[0], self._render_size, self._moved)
+        return np.asarray(draw_scene(self.layout, self.sim.arena, *scene), np.uint8)
 
     def close(self) -> None:
         """Free the engine."""
         self.batch.close()
 
     def _observation(self) -> Observation:
-        return {name: entry[0] for name, entry in self._table.observations().items()}
+        achieved = self.batch.seen.ravel()
+        return {
+            "observation": np.concatenate([achieved, self.batch.placed[0]]),
+            "achieved_goal": achieved.copy(),
+            "desired_goal": self.batch.seen_goals.ravel().copy(),
+        }
+
+    def _info(self, result: StepResult, named: int) -> dict[str, Any]:
+        """What is told of a step that named a token."""
+        share = float(result.overlap[0])
+        info: dict[str, Any] = {"overlap": share, "is_success": share >= self._success_overlap}
+        if result.camera_rewards is not None:
+            info["reward_camera"] = float(result.camera_rewards[0])
+        if result.refused[0]:
+            count = self.sim.actions_per_token
+            info["refused"] = f"token {named} is placed already: it had its {count} actions"
+        if result.blocked[0]:
+            info["blocked"] = (
+                f"token {self._moved} would lie on others by {result.covered[0]:.3%} of its area, "
+                f"at most {MAX_OVERLAP:.3%} allowed: set it down where there is room"
+            )
+        return info
+
+
+def _sim_config(settings: dict[str, Any]) -> SimConfig:
+    known = [field.name for field in fields(SimConfig)]
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        raise ConfigError(
+            f"unknown setting '{unknown[0]}' of the environment: besides shapes, scale and reward "
+            f"there are {', '.join(known)}"
+        )
+    return SimConfig(**settings)
 
 
 def check_render_mode(given: str | None) -> None:

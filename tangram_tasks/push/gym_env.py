@@ -16,10 +16,9 @@ from tangram_core.settings import check_range
 from tangram_core.setup import from_mapping
 from tangram_core.spec import Array
 from tangram_sim.drawing.scenes import draw_scene
-from tangram_sim.env import check_render_mode
+from tangram_sim.env import MAX_SIDE, Observation, check_render_mode
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.puzzles.assembly import COUNTS
-from tangram_sim.table import MAX_SIDE, Observation
 from tangram_tasks.push.env import PushEnv
 from tangram_tasks.push.places import ARENA
 from tangram_tasks.push.task import FURTHEST, PER_TOKEN, Push, PushConfig
