@@ -22,6 +22,7 @@ from tangram_core.errors import TangramError
 from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import declared_fields
 from tangram_core.setup import Setup, make_setup
+from tests.sim.builders import SEVEN
 from worker.play.rollout import Rollout, exploring
 from worker.play.session import Acting
 
@@ -106,6 +107,7 @@ PUSH: Config = {
         "looked_at": 8,
     },
 }
+PUSH_SEVEN = over(PUSH, tokens={"shapes": [*SEVEN], "scale": 0.6})
 
 # Setting -> a run in which it has an effect, and another value.
 SHOWS: dict[str, tuple[Config, object]] = {
@@ -166,6 +168,8 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "task.within": (PUSH, 0.5),
     "task.turned": (over(PUSH, task={"within": 0.5}), 3.0),
     "task.finger": (PUSH, 0.1),
+    "task.hand": (PUSH, "panda"),
+    "task.puzzle": (PUSH_SEVEN, ["cat"]),
     "task.longest": (PUSH, 1.0),
     "task.friction": (PUSH, "fixed"),
     "task.table_friction": (PUSH, [0.1, 0.2]),
