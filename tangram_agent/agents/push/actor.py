@@ -18,6 +18,7 @@ from tangram_core.task import Generators, History
 from tangram_tasks.push.task import Push
 
 CPU = torch.device("cpu")
+_SURE = 4  # times as many pushes are looked at where nothing is tried out
 
 
 class Played(nn.Module):
@@ -48,7 +49,8 @@ class PushActor(NetworkActor):
         scene = tokens.scene(corners, goals)
         drawn, any_push = self._drawn(len(corners), explore)
         with torch.no_grad():
-            looked_at = self._config.looked_at
+            times = 1 if explore is not None else _SURE
+            looked_at = min(times * self._config.looked_at, PUSHES)
             moved = self.network.table.moved
             slots = torch.arange(self._task.count).expand(len(corners), -1)
             found = best(self.network.critic, moved, tokens, scene, slots, drawn, looked_at)

@@ -17,7 +17,11 @@ class PushingConfig(EpisodeConfig, section="agent"):
 
     width: int = setting(128, "width of all layers", low=8, high=4096, part=NETWORK)
     looked_at: int = setting(
-        96, "pushes of each token that the critic values before one is played", low=2, high=1024
+        96,
+        "pushes of each token that the critic values before one is played; four times as many "
+        "where nothing is tried out",
+        low=2,
+        high=1024,
     )
     targets_looked_at: int = setting(
         8, "the same in the target of an update", low=2, high=1024, part=LEARNING

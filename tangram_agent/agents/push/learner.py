@@ -140,6 +140,7 @@ class PushLearner(NetworkLearner):
         learned = {"critic": self.critic, "alone": self.alone}
         others = {"table": self.table}
         super().__init__(learned, ("critic",), device, compiled=compiled, others=others)
+        self.table.renew(self.alone, self._tokens)  # pushes that all do nothing are all alike
 
     def rates(self, share: float) -> Rates:
         """The same for all networks; they fall along a cosine as the budget is used."""
