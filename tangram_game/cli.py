@@ -4,9 +4,8 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 instant.
 """
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from conf.cli import entry, tell
 from conf.commands import Plain
@@ -14,8 +13,6 @@ from conf.commands import Plain
 if TYPE_CHECKING:
     from tangram_agent.runs import Run
     from tangram_game.config import EvalConfig, PlayConfig
-
-    Config = TypeVar("Config", EvalConfig, PlayConfig)
 
 
 def evaluate() -> int:
@@ -33,7 +30,8 @@ def _evaluate(settings: Plain) -> int:
     from tangram_core.store.files import check_writable
     from tangram_game.config import EvalConfig
 
-    config = _with_figures(from_mapping(EvalConfig, with_changes(with_absolute_paths(settings))))
+    paths = _with_figures(with_changes(with_absolute_paths(settings)))
+    config = from_mapping(EvalConfig, paths)
     for name, path in (("out", config.out), ("sheet", config.sheet)):
         if path is not None:
             check_writable(name, Path(path))
@@ -46,15 +44,20 @@ def _evaluate(settings: Plain) -> int:
 
 
 def _play(settings: Plain) -> int:
+    from tangram_core.errors import ConfigError
     from tangram_core.setup import from_mapping
     from tangram_core.store.files import check_writable
-    from tangram_game.config import PlayConfig
+    from tangram_core.task import Task
+    from tangram_game.config import PLAN, PlayConfig
 
-    paths = with_absolute_paths(settings)
-    config = _with_figures(from_mapping(PlayConfig, with_changes(paths)))
+    paths = _with_figures(with_changes(with_absolute_paths(settings)))
+    config = from_mapping(PlayConfig, paths)
     check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
     stored = _check_played(config)
+    if Path(config.out).suffix == PLAN and type(stored.setup.task).plan is Task.plan:
+        kind = stored.setup.task_kind
+        raise ConfigError(f"out={config.out}: task={kind} makes no plan, set out=play.gif")
     if config.target is not None:
         from tangram_game.figures.photographs import read_photograph
 
@@ -71,20 +74,30 @@ def _play(settings: Plain) -> int:
     return play_run(config, filled)
 
 
-def _with_figures(config: "Config") -> "Config":
-    """Puzzles are a setting of a task of pushes."""
+def _with_figures(settings: Plain) -> Plain:
+    """Puzzles are a setting of a task of pushes.
+
+    Raises:
+        ConfigError: a file, or what says how puzzles of other tasks are shown.
+    """
     from tangram_agent.runs import read_changed
-    from tangram_game.config import is_puzzle_source
+    from tangram_core.errors import ConfigError
+    from tangram_game.config import check_puzzle, game_run
     from tangram_tasks.push.task import Push
 
-    if config.puzzle is None:
-        return config
-    changes = config.changes
-    if not isinstance(read_changed(config.run, changes).setup.task, Push):
-        return config
-    own = changes.get("task", {}) | {"puzzle": list(config.puzzle)}
-    shown = config.episodes if is_puzzle_source(config.puzzle[0]) else len(config.puzzle)
-    return replace(config, puzzle=None, episodes=shown, changes=changes | {"task": own})
+    puzzle, changes = check_puzzle(settings["puzzle"]), settings["changes"]
+    if puzzle is None:
+        return settings
+    run = settings["run_dir"] or game_run()
+    if not isinstance(read_changed(run, changes).setup.task, Push):
+        return settings
+    if settings.get("sheet") or settings["turns"] != 1 or Path(puzzle[0]).suffix:
+        raise ConfigError(
+            "task=push makes figures of the library, at an angle of each episode: leave turns "
+            "and sheet out, and set puzzle=cat"
+        )
+    own = changes.get("task", {}) | {"puzzle": list(puzzle)}
+    return settings | {"puzzle": None, "changes": changes | {"task": own}}
 
 
 def _check_played(config: "EvalConfig | PlayConfig") -> "Run":

@@ -107,8 +107,7 @@ def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
     whole, task = tests.play(player(tests.env)), tests.task
     scores: Scores = {**task.score(whole), "episodes": float(whole.episodes.count)}
     if not isinstance(task, Place):
-        decisions = whole.episodes.actions.shape[1]
-        return scores | {"ms_per_decision": 1e3 * float(whole.seconds.mean()) / decisions}
+        return scores
     played = Played.of(whole)
     if task.outlines:
         return scores | of_outlines(task, played, at_once)

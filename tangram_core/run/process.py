@@ -141,8 +141,10 @@ class Watchdog:
     def patient(self, seconds: float = PATIENT_S) -> Iterator[None]:
         """What is done within may take so long without progress."""
         self._wind(seconds)
-        yield
-        self._wind()
+        try:
+            yield
+        finally:
+            self._wind()
 
     def _wind(self, seconds: float | None = None) -> None:
         if self._seconds:

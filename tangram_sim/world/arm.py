@@ -22,7 +22,7 @@ LIFTED, LOWERED = 0.06, 0.008  # heights of the peg's tip
 BASE = (-0.5, 0.0, 0.0)
 _PEG = 0.1  # from between the gripper's fingers down to the tip
 _JOINTS, _GRASP = tuple(range(7)), 11
-_HOME = (0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785)
+HOME = (0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785)
 _DOWN = (1.0, 0.0, 0.0, 0.0)  # the gripper's orientation
 _STEP = 1.0 / 240.0  # seconds
 _SOLVES, _CLOSE = 40, 1e-6  # of the inverse kinematics, from where the joints are
@@ -86,7 +86,7 @@ class Panda:
 
     def home(self) -> None:
         """Back to where it begins, at rest."""
-        self.at(_HOME)
+        self.at(HOME)
         self.at(self._solved(np.array([0.0, 0.0, LIFTED])))
 
     def at(self, joints: Sequence[float]) -> None:
@@ -164,7 +164,7 @@ class Panda:
         return list(found[: len(_JOINTS)])
 
     def _solved(self, tip: Floats) -> list[float]:
-        angles = list(_HOME)
+        angles = list(HOME)
         for _ in range(10):
             angles = self._angles(tip)
             self.at(angles)

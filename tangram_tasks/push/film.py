@@ -15,7 +15,7 @@ from tangram_core.task import Played
 from tangram_sim.drawing.game_drawing import tiles
 from tangram_sim.drawing.scenes import contact_sheet, draw_scene
 from tangram_sim.drawing.strokes import MARGIN, TEXT
-from tangram_sim.world.arm import METRES, Motion, Panda
+from tangram_sim.world.arm import HOME, LIFTED, METRES, Motion, Panda
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_sim.world.stage import Stage
 from tangram_tasks.push.places import ARENA, AWAY, Push, on_table, push_of
@@ -34,7 +34,7 @@ class Replayed:
         facts = {name: one[episode] for name, one in played.facts.items()}
         self.task, self.corners, self.goals = task, facts["corners"], facts["goals"][0]
         self.present = on_table(self.goals, task.layout)
-        self.actions, self.refused = played.episodes.actions[episode], facts["refused"][1:]
+        self.actions = played.episodes.actions[episode]
         ended = played.episodes.terminated[episode].astype(bool)
         self.count = int(ended.argmax()) + 1 if ended.any() else len(ended)
         names = ("table", "spread", "finger", "centres")
@@ -42,12 +42,11 @@ class Replayed:
         self.unknowns = Unknowns(table, spread, float(finger), centres)
 
     def push(self, number: int) -> Push | None:
-        """Which push was made; None: it was refused."""
-        task, config = self.task, self.task.config
-        if self.refused[number]:
-            return None
-        action = self.actions[number]
-        return push_of(task.layout, self.corners[number], action, config.finger, config.longest)
+        """Which push was tried; None: the finger could not come down."""
+        config, corners = self.task.config, self.corners[number]
+        given = corners, self.actions[number], config.finger, config.longest
+        push = push_of(self.task.layout, *given)
+        return None if push.refused else push
 
     def followed(self, table: PushTable, number: int, path: Floats) -> list[Floats]:
         """Corners (V, 2) at each point of a finger's path, ending as they were recorded."""
@@ -101,6 +100,8 @@ def from_the_side(task: "Task", played: Played) -> Iterator[Image.Image]:
                 motion = push and arm.push(push.begin * METRES, push.way * METRES)
                 if motion:
                     moments += _moments(one, table, number, motion)
+            if not moments:  # nothing was pushed
+                moments.append((np.array(HOME), np.array([0.0, 0.0, LIFTED]), one.corners[0]))
             for at in np.linspace(0, len(moments) - 1, min(FRAMES, len(moments))).astype(int):
                 yield stage.seen(*moments[at])
 

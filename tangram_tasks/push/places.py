@@ -13,7 +13,7 @@ from tangram_core.arrays import AnyArray, Bools, Floats, Ints
 from tangram_core.errors import ConfigError, SamplingError
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.puzzles.figures import SPLITS, library
+from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.sampling import sample_batch
 from tangram_sim.targets.targets import has_all_tans, placement, sample_targets, turned_figure
 
@@ -166,8 +166,8 @@ def figures_of(layout: Layout, scale: float, named: Sequence[str]) -> Iterator[F
     Raises:
         ConfigError: there is no such figure, it has other pieces, or the table is too small.
     """
-    known = {split: library(split, scale) for split in SPLITS}
-    known |= {one.name: (one,) for split in SPLITS for one in known[split]}
+    known = {split: library(split, scale) for split in ("train", "test")}
+    known |= {one.name: (one,) for of_split in [*known.values()] for one in of_split}
     for name in named:
         if name not in known:
             raise ConfigError(f"no puzzle '{name}': choose from {', '.join(known)}")

@@ -56,6 +56,8 @@ def _pushes(one: Replayed, arm: Panda | None) -> Iterator[Json]:
             continue
         begin, way = push.begin * METRES, push.way * METRES
         motion, points = arm and arm.push(begin, way), list[Json]()
+        if arm and not motion:
+            continue
         for part, there in way_points(begin, way):
             seconds += duration(part, float(np.linalg.norm(there - here)))
             here = there

@@ -41,8 +41,9 @@ class PushConfig(Settings, section="task"):
     )
     puzzle: tuple[str, ...] = setting(
         (),
-        "figures that the seven tans are to make, at any angle, by name, or train, test or paper, "
-        "all of the library's; none: tokens touch as chance has it, or as figures of train do",
+        "figures that the seven tans are to make, one for each episode, at any angle: names of the "
+        "library, or train or test for all of these; none: tokens touch as chance has it, or as "
+        "figures of train do",
     )
     within: float = setting(0.03, "distance at which a token is in its place", low=1e-4, high=1)
     turned: float = setting(0.1, "turn within which it is", low=1e-4, high=4, unit="rad")
@@ -138,7 +139,8 @@ class Push(Task):
         named = self.config.puzzle
         if named and self.count < self.layout.tokens:
             raise ConfigError(
-                f"task.puzzle needs all tokens, got task.count={self.count}: set it 0"
+                f"task.puzzle needs all seven tans on the table, got task.count={self.count}: set "
+                "task.count=0, and play an agent that was trained so"
             )
         return tuple(figures_of(self.layout, self.tokens.scale, named))
 

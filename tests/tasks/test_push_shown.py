@@ -183,7 +183,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
-    told = [f"run_dir={run}", "puzzle=[cat]"]
+    told = [f"run_dir={run}", "puzzle=[cat]", "episodes=2"]
     for name in ("cat.png", "cat.json"):
         assert here("tangram-play", *told, f"out={tmp_path / name}", cwd=tmp_path)[0] == 0
     plan = json.loads((tmp_path / "cat.json").read_text())
@@ -192,3 +192,21 @@ def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
     status, _, err = here("tangram-play", *told[:1], "puzzle=dodo", cwd=tmp_path)
     assert status == 2
     assert "no puzzle 'dodo': choose from" in err
+    for wrong, reason in (("turns=2", "leave turns"), ("task.count=2", "does not fit this run")):
+        status, _, err = here("tangram-play", *told, wrong, cwd=tmp_path)
+        assert (status, reason in err) == (2, True), err
+
+
+def test_a_task_without_a_plan_writes_none(tmp_path: Path) -> None:
+    told = ("run_dir=pretrained/square", f"out={tmp_path / 'x.json'}")
+    status, _, err = here("tangram-play", *told, cwd=tmp_path)
+    assert (status, list(tmp_path.iterdir())) == (2, [])
+    assert "task=place makes no plan, set out=play.gif" in err
+
+
+def test_an_arm_that_never_pushed_is_filmed_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Panda, "push", lambda *_: None)
+    played = by_planner(HELD)
+    assert played.facts["refused"][:, 1:].all()
+    assert len(list(from_the_side(HELD, played))) == 1
+    assert HELD.plan(played)["pushes"] == []
