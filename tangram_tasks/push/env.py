@@ -49,8 +49,8 @@ class PushEnv(Env):
             present[tokens], every[tokens], desired[tokens] = True, starts, goals
             self.unknowns[b] = self._drawn(rng)
             self.tables[b].place(every, present, self.unknowns[b])
-            for arm in self.arms[b : b + 1]:
-                arm.home()
+            if self.arms:
+                self.arms[b].home()
             self.goals[b] = self.corners_of(desired, present)
             self.corners[b] = self.corners_of(every, present)
         self.refused, self._ended = [""] * self.count, np.zeros(self.count, np.bool_)
@@ -76,8 +76,8 @@ class PushEnv(Env):
     def _push(self, b: int, begin: Floats, way: Floats) -> str:
         """Push on a table; why an arm could not."""
         path = np.stack([begin, begin + way])
-        for arm in self.arms[b : b + 1]:
-            motion = arm.push(begin * METRES, way * METRES)
+        if self.arms:
+            motion = self.arms[b].push(begin * METRES, way * METRES)
             if motion is None:
                 return "the arm does not get there"
             path = motion.pushed / METRES

@@ -70,6 +70,14 @@ def test_what_an_arm_cannot_reach_is_refused_and_it_goes_on(arm: Panda) -> None:
     went(arm, [0.1, 0.0], [0.05, 0.0])
 
 
+@pytest.mark.parametrize("limit", ["fastest", "high"])
+def test_a_joint_beyond_its_limits_is_refused(
+    arm: Panda, limit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(arm, limit, {"fastest": arm.fastest * 0.01, "high": arm.low}[limit])
+    assert arm.push(np.array([0.1, 0.0]), np.array([0.05, 0.0])) is None
+
+
 def by_planner(task: Push, count: int = 1) -> Played:
     with closing(task.make(count, "test")) as env:
         planner = Planner(task, env, 24)  # type: ignore[arg-type]
