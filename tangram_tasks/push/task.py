@@ -5,7 +5,7 @@ Legend: E episodes, T pushes of an episode, K tokens, V corners, n rows.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, cast
 
@@ -189,14 +189,18 @@ class Push(Task):
         return PushEnv(self, count)
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """Chance, what was tried of each shape alone, and what an engine of one's own finds."""
-        from tangram_tasks.push.rivals import Planner  # noqa: PLC0415
-        from tangram_tasks.push.table_rival import Lookup  # noqa: PLC0415
+        """Chance, what was tried of each shape alone, and planners with an engine of their own."""
+        from tangram_tasks.push.rivals import ROUNDS, TRIED, Planner  # noqa: PLC0415
+
+        def planner(env: Env, knows: str) -> Chooser:
+            return Planner(self, cast("PushEnv", env), TRIED, ROUNDS, knows)
 
         return {
             "random": super().rivals()["random"],
-            "table": lambda env: Lookup(self, cast("PushEnv", env)),
-            "planner": lambda env: Planner(self, cast("PushEnv", env)),
+            "table": lambda env: Planner(self, cast("PushEnv", env)),
+            "planner": partial(planner, knows="middle"),
+            "planner, told friction": partial(planner, knows="all"),
+            "planner, wrong friction": partial(planner, knows="wrong"),
         }
 
     def score(self, played: Played) -> dict[str, float]:

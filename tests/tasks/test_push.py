@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import tangram_sim.world.pushing as table_module
-import tangram_tasks.push.table_rival as rival_module
+import tangram_tasks.push.rivals as rival_module
 from tangram_core.conformance import check_task, play
 from tangram_core.errors import ConfigError, SamplingError
 from tangram_core.seeding import episode_generator
@@ -37,7 +37,7 @@ def generators(count: int) -> list[np.random.Generator]:
 @pytest.fixture
 def few_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rival_module, "PUSHES", 300)
-    rival_module.tried.cache_clear()
+    rival_module.tried_alone.cache_clear()
 
 
 @pytest.mark.parametrize("task", [SQUARE, SOME], ids=["square", "two of three"])

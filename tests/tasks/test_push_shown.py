@@ -80,7 +80,7 @@ def test_a_joint_beyond_its_limits_is_refused(
 
 def by_planner(task: Push, count: int = 1) -> Played:
     with closing(task.make(count, "test")) as env:
-        planner = Planner(task, env, 24)  # type: ignore[arg-type]
+        planner = Planner(task, env, 12)  # type: ignore[arg-type]
         return play(env, task.spec, planner, lambda i: generators(9)[i], count, facts=True)
 
 

@@ -3,6 +3,8 @@
 Legend: n tables, K tokens of each, P pushes that are drawn for each token, N that are looked at.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -64,4 +66,5 @@ def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: 
 
 
 def _only(seen: Seen, rows: Tensor) -> Seen:
-    return Seen(*(one[rows] for one in vars(seen).values()))
+    """With what critics see of these rows alone."""
+    return replace(seen, token=seen.token[rows], others=seen.others[rows], there=seen.there[rows])

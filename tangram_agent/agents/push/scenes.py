@@ -1,5 +1,6 @@
 """Tables with tokens as tensors, and the geometry of convex polygons.
 
+Polygons have x and y first, then their corners: so one operation goes through all rows.
 Legend: n rows, K tokens of a row, S tokens of the set, C corners of the largest, N pushes.
 """
 
@@ -44,6 +45,7 @@ class Tokens:
     Attributes:
         count: K.
         outlines: (S, C, 2) in their own frames; the smaller ones repeat their last corner.
+        corners: (2, C, S) the same.
         periods: (S,) turns that change nothing.
         begins, ends: (S, N, 2) of the finger, in the frames of the tokens.
         actions: (S, N, 4) these pushes, as the task takes them.
@@ -71,6 +73,7 @@ class Tokens:
             tensor((begins + ways).reshape(shape)),
         )
         self.outlines = tensor(layout.body[layout.padded_corners])
+        self.corners = self.outlines.permute(2, 1, 0).contiguous()
         self.periods = tensor(2.0 * np.pi / layout.symmetries)
         self._place = place
 
@@ -116,12 +119,11 @@ class Tokens:
         return torch.cat([way, turn[..., None]], dim=-1)
 
     def laid(self, poses: Tensor, which: Tensor) -> Tensor:
-        """(..., C, 2) outlines of tokens at poses (..., 3)."""
-        # A product of matrices: a compiler would unroll sums of two into every corner's use.
+        """(2, C, ...) outlines of tokens at poses (..., 3)."""
         cos, sin = torch.cos(poses[..., 2]), torch.sin(poses[..., 2])
-        turns = torch.stack([torch.stack(one, dim=-1) for one in ((cos, sin), (-sin, cos))], dim=-2)
-        laid: Tensor = self.outlines[which] @ turns + poses[..., None, :2]
-        return laid
+        x, y = self.corners[:, :, which]
+        laid = cos * x - sin * y + poses[..., 0], sin * x + cos * y + poses[..., 1]
+        return torch.stack(laid)
 
 
 def rotated(vectors: Tensor, angles: Tensor) -> Tensor:
@@ -138,30 +140,34 @@ def placed_at(poses: Tensor, moved: Tensor) -> Tensor:
 
 
 def distance(outlines: Tensor, points: Tensor) -> Tensor:
-    """(...) from points (..., 2) to convex polygons (..., C, 2); 0 inside."""
-    edges = outlines.roll(-1, -2) - outlines
-    to = points[..., None, :] - outlines
-    squares = edges.square().sum(-1)
-    share = ((to * edges).sum(-1) / squares.clamp_min(1e-9)).clamp(0.0, 1.0)
-    apart = (to - share[..., None] * edges).norm(dim=-1).amin(-1)
-    side = edges[..., 0] * to[..., 1] - edges[..., 1] * to[..., 0]
-    inside = ((side >= 0.0) | (squares < 1e-9)).all(-1)
+    """(...) from points (2, ...) to convex polygons (2, C, ...); 0 inside."""
+    edges, to = outlines.roll(-1, 1) - outlines, points[:, None] - outlines
+    squares = _dot(edges, edges)
+    share = (_dot(to, edges) / squares.clamp_min(1e-9)).clamp(0.0, 1.0)
+    beside = to - share * edges
+    apart = _dot(beside, beside).amin(0).sqrt()
+    side = edges[0] * to[1] - edges[1] * to[0]
+    inside = ((side >= 0.0) | (squares < 1e-9)).all(0)
     return torch.where(inside, 0.0, apart)
 
 
 def gap(some: Tensor, others: Tensor) -> Tensor:
-    """(...) between convex polygons (..., C, 2); where they overlap minus the depth.
+    """(...) between convex polygons (2, C, ...); where they overlap minus the depth.
 
     The largest distance along a normal of an edge (the separating axis theorem): where corner
     stands against corner, the true distance is more.
     """
     found = []
     for one, other in ((some, others), (others, some)):
-        edges = one.roll(-1, -2) - one
-        lengths = edges.norm(dim=-1, keepdim=True)
-        normals = torch.stack([edges[..., 1], -edges[..., 0]], dim=-1) / lengths.clamp_min(1e-6)
-        furthest = (normals * one).sum(-1)
-        nearest = (normals @ other.transpose(-1, -2)).amin(-1)
-        apart = torch.where(lengths[..., 0] < 1e-6, -torch.inf, nearest - furthest)
-        found.append(apart.amax(-1))
+        edges = one.roll(-1, 1) - one
+        lengths = _dot(edges, edges).sqrt()
+        normals = torch.stack([edges[1], -edges[0]]) / lengths.clamp_min(1e-6)
+        nearest = _dot(normals[:, :, None], other[:, None]).amin(1)
+        apart = torch.where(lengths < 1e-6, -torch.inf, nearest - _dot(normals, one))
+        found.append(apart.amax(0))
     return torch.maximum(*found)
+
+
+def _dot(some: Tensor, others: Tensor) -> Tensor:
+    """(...) of vectors (2, ...)."""
+    return some[0] * others[0] + some[1] * others[1]

@@ -45,7 +45,7 @@ class Seen:
         there: (n, K - 1) 1 where there is one.
         pose, left: (n, 3) its pose, and its way to its place, in its own frame.
         which: (n,) token of the set.
-        outlines: (n, K - 1, C, 2) of the others, on the table.
+        outlines: (2, C, n, K - 1) of the others, on the table.
     """
 
     token: Tensor
@@ -68,10 +68,11 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor) -> Seen:
     poses, goals, kinds = scene.poses[at], scene.goals[at], scene.which[at]
     outlines = tokens.laid(poses, kinds)
 
-    def here(points: Tensor) -> Tensor:  # (n, K - 1, ..., 2) in the token's frame
-        shape = (-1, *[1] * (points.ndim - 2))
-        moved = points - pose[:, :2].view(*shape, 2)
-        return rotated(moved, -pose[:, 2].view(shape).expand(points.shape[:-1]))
+    x, y, cos, sin = (one[:, None] for one in (*pose[:, :2].T, pose[:, 2].cos(), pose[:, 2].sin()))
+
+    def here(points: Tensor) -> Tensor:  # (..., n, K - 1, 2) in the token's frame, of (2, ...)
+        right, up = points[0] - x, points[1] - y
+        return torch.stack([cos * right + sin * up, cos * up - sin * right], dim=-1)
 
     def heading(angles: Tensor) -> Tensor:
         turn = angles - pose[:, None, 2]
@@ -80,10 +81,10 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor) -> Seen:
     others = [
         ways(tokens, left[at]),
         tokens.outlines[kinds].flatten(2) * _LARGE,
-        here(poses[..., :2]),
+        here(poses.movedim(-1, 0)),
         heading(poses[..., 2]),
-        here(outlines).flatten(2),
-        here(goals[..., :2]),
+        here(outlines).permute(1, 2, 0, 3).flatten(2),
+        here(goals.movedim(-1, 0)),
         heading(goals[..., 2]),
     ]
     there = scene.present[at].to(pose.dtype)
@@ -121,23 +122,23 @@ def pushes(
     """
     pose = seen.pose[:, None].expand(*moved.shape)
     first, last = (rotated(at, pose[..., 2]) + pose[..., :2] for at in (begins, ends))
-    middle = (first + last) / 2.0
     limit = ARENA / 2.0 - tokens.finger
     beyond = (torch.maximum(first.abs(), last.abs()) > limit).any(-1)
     left = tokens.after(seen.left[:, None], moved, seen.which[:, None])
     parts = [moved * 3.0, edge(first), edge(last), ways(tokens, left)]
-    others = seen.outlines[:, None]
-    if not seen.outlines.shape[1]:
+    others = seen.outlines[:, :, :, None]
+    if not others.shape[-1]:
         parts.append(torch.ones_like(moved[..., :1]).expand(*moved.shape[:2], 4))
         return torch.cat(parts, dim=-1), beyond
     which = seen.which[:, None].expand(moved.shape[:2])
+    first, last = (at.movedim(-1, 0)[..., None] for at in (first, last))
     near = [
-        distance(others, last[:, :, None]) - tokens.finger,
-        distance(others, middle[:, :, None]) - tokens.finger,
-        gap(tokens.laid(placed_at(pose, moved), which)[:, :, None], others),
-        gap(tokens.laid(placed_at(pose, moved / 2.0), which)[:, :, None], others),
+        distance(others, last) - tokens.finger,
+        distance(others, (first + last) / 2.0) - tokens.finger,
+        gap(tokens.laid(placed_at(pose, moved), which)[..., None], others),
+        gap(tokens.laid(placed_at(pose, moved / 2.0), which)[..., None], others),
     ]
     least = torch.stack([one.amin(-1) for one in near], dim=-1)
     parts.append(least.clamp(-_NEAR, _NEAR) / _NEAR)
-    blocked = distance(others, first[:, :, None]).amin(-1) < tokens.finger
+    blocked = distance(others, first).amin(-1) < tokens.finger
     return torch.cat(parts, dim=-1), beyond | blocked
