@@ -20,6 +20,7 @@ MAX_SHOWN = 100
 MAX_TURNS = 360
 MAX_SOLUTIONS = 20
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
+ALL = ("all",)
 PICTURES = (".gif", ".mp4", ".png")
 PLAN = ".json"
 WRITTEN = (*PICTURES, PLAN)
@@ -84,6 +85,9 @@ class EvalConfig(Settings):
     )
     seed: int = setting(
         0, "of the test episodes, and of the starts of puzzles", low=0, high=MAX_SEED
+    )
+    rivals: tuple[str, ...] = setting(
+        ALL, "who learned nothing and plays the same: all whom the task has, some by name, [] none"
     )
     out: str | None = setting(None, "JSON file for the scores; they are printed anyway")
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)

@@ -16,11 +16,12 @@ from rich.table import Table
 from tangram_agent.agents.outline.agent import Outline
 from tangram_agent.runs import Run, load_changed
 from tangram_core.agent import AT_ONCE
+from tangram_core.errors import ConfigError
 from tangram_core.run.outcome import plural
 from tangram_core.scores import Score
 from tangram_core.store.files import write_whole
 from tangram_core.task import Task
-from tangram_game.config import EvalConfig, source_and_names
+from tangram_game.config import ALL, EvalConfig, source_and_names
 from tangram_game.figures.puzzles import Player, by, find_figures
 from tangram_game.scores import (
     RUN,
@@ -80,9 +81,23 @@ def evaluate_run(config: EvalConfig) -> int:
     return 0
 
 
-def policies(run: Run) -> dict[str, Player]:
-    """The run, and those to compare it with, by their names in tables and files."""
-    result, task = {RUN: by(run.actor)}, run.setup.task
+def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
+    """The run, and those to compare it with, by their names in tables and files.
+
+    Raises:
+        ConfigError: there is no such rival.
+    """
+    others = _rivals(run)
+    if tuple(rivals) != ALL:
+        for name in rivals:
+            if name not in others:
+                raise ConfigError(f"rivals: no '{name}' here, choose from all, {', '.join(others)}")
+        others = {name: others[name] for name in rivals}
+    return {RUN: by(run.actor)} | others
+
+
+def _rivals(run: Run) -> dict[str, Player]:
+    task, result = run.setup.task, dict[str, Player]()
     rivals, agent = dict(task.rivals()), run.setup.agent
     if isinstance(agent, Outline):
         if agent.config.beam > 1:
@@ -118,7 +133,7 @@ def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Play the test episodes and print the scores; the file's content."""
     task = run.setup.task
-    scores = score_policies(task, policies(run), config, run.actor.at_once)
+    scores = score_policies(task, policies(run, config.rivals), config, run.actor.at_once)
     tests = "fixed tests" if config.seed == 0 else f"tests of seed {config.seed}"
     caption = f"{config.episodes:,} {tests}"
     if isinstance(task, Place):
@@ -137,7 +152,7 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     else:
         hides = task.sim.observe in SILHOUETTES and not task.outlines
         score = score_hidden if hides else score_puzzles
-        scored = score(task, figures, policies(run), config.seed, run.actor.at_once)
+        scored = score(task, figures, policies(run, config.rivals), config.seed, run.actor.at_once)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(figures)

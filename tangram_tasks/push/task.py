@@ -199,8 +199,8 @@ class Push(Task):
             "random": super().rivals()["random"],
             "table": lambda env: Planner(self, cast("PushEnv", env)),
             "planner": partial(planner, knows="middle"),
-            "planner, told friction": partial(planner, knows="all"),
-            "planner, wrong friction": partial(planner, knows="wrong"),
+            "planner_told": partial(planner, knows="all"),
+            "planner_wrong": partial(planner, knows="wrong"),
         }
 
     def score(self, played: Played) -> dict[str, float]:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from tangram_core.errors import RunError
+from tangram_core.errors import ConfigError, RunError
 from tangram_game.config import EvalConfig, PlayConfig
 from tangram_game.evaluate import evaluate_run, scores_table
 from tangram_game.play import play_run
@@ -63,6 +63,14 @@ def test_evaluation_writes_scores_and_prints_them(
     for told in (f"{report['mean_reward']:.3f}", "run after 7 updates", "position only"):
         assert told in printed
     assert "10 fixed tests, 1 action a token" in printed
+
+
+def test_only_the_rivals_that_are_asked_for_are_scored(tmp_path: Path) -> None:
+    few = evaluated(tmp_path, SQUARE, episodes=2, rivals=("exact",))
+    assert {*few["baselines"]} == {"exact"}
+    assert evaluated(tmp_path, SQUARE, episodes=2, rivals=())["baselines"] == {}
+    with pytest.raises(ConfigError, match="no 'exakt' here, choose from all, exact, position only"):
+        evaluated(tmp_path, SQUARE, episodes=2, rivals=("exakt",))
 
 
 def test_evaluation_repeats_itself_and_other_tests_differ(tmp_path: Path) -> None:

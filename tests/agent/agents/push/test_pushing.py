@@ -61,8 +61,8 @@ def test_distances_and_gaps_are_those_of_polygons() -> None:
     poses = torch.from_numpy(rng.uniform(-1, 1, (2, 300, 3)) * (0.4, 0.4, np.pi)).float()
     points = torch.from_numpy(rng.uniform(-0.5, 0.5, (300, 2))).float()
     some, others = (tokens.laid(poses[i], which[i]) for i in range(2))
-    far, between = distance(some, points), gap(some, others)
-    shapes = [[Polygon(one) for one in outlines.numpy()] for outlines in (some, others)]
+    far, between = distance(some, points.T), gap(some, others)
+    shapes = [[Polygon(one) for one in every.permute(2, 1, 0).numpy()] for every in (some, others)]
     for i, (one, other) in enumerate(zip(*shapes, strict=True)):
         assert far[i] == pytest.approx(one.distance(Point(points[i].numpy())), abs=1e-5)
         if one.intersects(other):
