@@ -165,6 +165,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.targets_looked_at": (PUSH, 2),
     "agent.some_share": (PUSH, 1.0),
     "task.count": (PUSH, 1),
+    "task.fewer": (PUSH, [1.0]),
     "task.within": (PUSH, 0.5),
     "task.turned": (over(PUSH, task={"within": 0.5}), 3.0),
     "task.finger": (PUSH, 0.1),

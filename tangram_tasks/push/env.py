@@ -3,6 +3,7 @@
 Legend: B environments, K tokens, V corners.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -27,9 +28,10 @@ class PushEnv(Env):
         unknowns: (B,) what was drawn for the episode: for planners that are told.
     """
 
-    def __init__(self, task: "Push", count: int) -> None:
-        """Set up the tables."""
+    def __init__(self, task: "Push", count: int, fewer: Sequence[float] = ()) -> None:
+        """Set up the tables; weights of 1, 2, ... tokens, none: as many as the task has."""
         self.count, self._task = count, task
+        self._fewer = np.array(fewer) / (sum(fewer) or 1.0)
         self.tables = [PushTable(task.layout, task.config.finger) for _ in range(count)]
         self.arms = [Panda() for _ in range(count if task.config.hand == "panda" else 0)]
         shape = (count, task.layout.corner_count, 2)
@@ -43,7 +45,11 @@ class PushEnv(Env):
         """Lay out an episode on every table."""
         layout = self._task.layout
         for b, rng in enumerate(generators):
-            tokens, starts, goals = begin(layout, self._task.count, rng, self._task.figures)
+            count, figures = self._task.count, self._task.figures
+            if len(self._fewer):
+                count = 1 + int(rng.choice(len(self._fewer), p=self._fewer))
+            whole = count == layout.tokens
+            tokens, starts, goals = begin(layout, count, rng, figures if whole else ())
             present, every, desired = self._present[b], *np.zeros((2, layout.tokens, 3))
             present[:] = False
             present[tokens], every[tokens], desired[tokens] = True, starts, goals

@@ -14,7 +14,7 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Ints, Pixels
 from tangram_core.errors import ConfigError
 from tangram_core.scores import Score
-from tangram_core.settings import NETWORK, Settings, setting
+from tangram_core.settings import LEARNING, Settings, setting
 from tangram_core.spec import Array, EpisodeSpec, Field
 from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
@@ -37,7 +37,12 @@ class PushConfig(Settings, section="task"):
         "tokens on the table, drawn from the set for each episode; 0: all of it",
         low=0,
         high=16,
-        part=NETWORK,
+    )
+    fewer: tuple[float, ...] = setting(
+        (),
+        "weights of episodes with 1, 2, 3, ... tokens while it learns; none: always task.count",
+        low=0,
+        part=LEARNING,
     )
     puzzle: tuple[str, ...] = setting(
         (),
@@ -118,6 +123,12 @@ class Push(Task):
                 f"task.count={self.config.count} of {self.layout.tokens} tokens: set it to at most "
                 f"{self.layout.tokens}, or take a larger set, as in tokens=tangram7"
             )
+        fewer = self.config.fewer
+        if fewer and (len(fewer) > self.count or not sum(fewer)):
+            raise ConfigError(
+                f"task.fewer={[*fewer]} must have a weight above 0, and at most one for each of "
+                f"{self.count} tokens: write it as [0,1,1] for two tokens and three, as often"
+            )
 
     @cached_property
     def layout(self) -> Layout:
@@ -182,11 +193,11 @@ class Push(Task):
         if plays and find_spec("pybullet") is None:
             raise ConfigError("task=push needs PyBullet, which is missing: pip install pybullet")
 
-    def make(self, count: int, purpose: Purpose = "play") -> Env:  # noqa: ARG002
+    def make(self, count: int, purpose: Purpose = "play") -> Env:
         """So many tables in this process."""
         from tangram_tasks.push.env import PushEnv  # noqa: PLC0415
 
-        return PushEnv(self, count)
+        return PushEnv(self, count, self.config.fewer if purpose == "play" else ())
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
         """Chance, what was tried of each shape alone, and planners with an engine of their own."""

@@ -1,6 +1,7 @@
 """Tokens that a finger pushes: what a push is, where they come, and who learned nothing."""
 
 import warnings
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
@@ -18,7 +19,7 @@ from tangram_core.seeding import episode_generator
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
-from tangram_tasks.push.places import AWAY, push_of
+from tangram_tasks.push.places import AWAY, on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
 
 pytestmark = pytest.mark.fast
@@ -35,8 +36,10 @@ def generators(count: int) -> list[np.random.Generator]:
 
 
 @pytest.fixture
-def few_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_tried(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(rival_module, "PUSHES", 300)
+    rival_module.tried_alone.cache_clear()
+    yield
     rival_module.tried_alone.cache_clear()
 
 
@@ -188,10 +191,20 @@ def test_one_of_two_tokens_is_half_of_the_reward() -> None:
         assert env.step(away).rewards.tolist() == [-0.5]
 
 
+def test_it_learns_from_fewer_tokens_too_and_is_tested_with_all() -> None:
+    task = replace(TWO, config=PushConfig(fewer=(3.0, 1.0)))
+    for purpose, counts in (("play", {1, 2}), ("test", {2})):
+        with closing(task.make(12, purpose)) as env:  # type: ignore[arg-type]
+            seen = env.reset(generators(12))
+        assert {*on_table(seen["goals"], task.layout).sum(axis=1).tolist()} == counts
+
+
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
         ({"count": 2}, "task.count=2 of 1 tokens: set it to at most 1, or take a larger set"),
+        ({"fewer": (1.0, 1.0)}, "task.fewer=.1.0, 1.0. must have .* for each of 1 tokens"),
+        ({"fewer": (0.0,)}, "task.fewer=.0.0. must have a weight above 0"),
         ({"spread": (2.0, 1.0)}, "task.spread must be a range, got .2.0, 1.0.: write it as"),
         ({"finger_friction": (0.1,)}, "task.finger_friction must be a range"),
         ({"within": 0.0}, "task.within must be between"),

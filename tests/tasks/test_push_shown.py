@@ -200,7 +200,7 @@ def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
     status, _, err = here("tangram-play", *told[:1], "puzzle=dodo", cwd=tmp_path)
     assert status == 2
     assert "no puzzle 'dodo': choose from" in err
-    for wrong, reason in (("turns=2", "leave turns"), ("task.count=2", "does not fit this run")):
+    for wrong, reason in (("turns=2", "leave turns"), ("task.count=2", "needs all seven")):
         status, _, err = here("tangram-play", *told, wrong, cwd=tmp_path)
         assert (status, reason in err) == (2, True), err
 
