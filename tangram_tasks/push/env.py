@@ -14,7 +14,8 @@ from tangram_core.spec import Arrays
 from tangram_core.task import Env, Generators, Step
 from tangram_sim.world.arm import METRES, Panda
 from tangram_sim.world.pushing import PushTable, Unknowns
-from tangram_tasks.push.places import AWAY, begin, push_of
+from tangram_tasks.push.places import AWAY, begin, corners_of, push_of
+from tangram_tasks.push.trials import middle
 
 if TYPE_CHECKING:
     from tangram_tasks.push.task import Push
@@ -39,7 +40,7 @@ class PushEnv(Env):
         self.goals: Floats = np.full(shape, AWAY)
         self._present: Bools = np.zeros((count, task.layout.tokens), np.bool_)
         self.refused, self._ended = [""] * count, np.zeros(count, np.bool_)
-        self.unknowns = [self.middle] * count
+        self.unknowns = [middle(task)] * count
 
     def reset(self, generators: Generators) -> Arrays:
         """Lay out an episode on every table."""
@@ -57,8 +58,8 @@ class PushEnv(Env):
             self.tables[b].place(every, present, self.unknowns[b])
             if self.arms:
                 self.arms[b].home()
-            self.goals[b] = self.corners_of(desired, present)
-            self.corners[b] = self.corners_of(every, present)
+            self.goals[b] = corners_of(layout, desired, present)
+            self.corners[b] = corners_of(layout, every, present)
         self.refused, self._ended = [""] * self.count, np.zeros(self.count, np.bool_)
         return self._seen()
 
@@ -71,7 +72,8 @@ class PushEnv(Env):
             push = push_of(layout, self.corners[b], action, config.finger, config.longest)
             self.refused[b] = push.refused or self._push(b, push.begin, push.way)
             if not self.refused[b]:
-                self.corners[b] = self.corners_of(self.tables[b].poses(), self._present[b])
+                poses, there = self.tables[b].poses(), self._present[b]
+                self.corners[b] = corners_of(layout, poses, there)
         # As the master has them, which comes to the same reward.
         corners, goals = self.corners.astype(np.float32), self.goals.astype(np.float32)
         placed = self._task.placed(corners, goals)
@@ -107,20 +109,13 @@ class PushEnv(Env):
         for arm in self.arms:
             arm.close()
 
-    @property
-    def middle(self) -> Unknowns:
-        """The middle of what is drawn."""
-        config, alike = self._task.config, np.ones(self._task.layout.tokens)
-        spread, finger = float(np.mean(config.spread)), float(np.mean(config.finger_friction))
-        return Unknowns(alike, spread * alike, finger, np.zeros((len(alike), 2)))
-
     def _drawn(self, rng: np.random.Generator) -> Unknowns:
         """Frictions and centres of mass of an episode."""
         layout, config = self._task.layout, self._task.config
         tokens, own = layout.tokens, config.table_friction
         spread, finger = config.spread, config.finger_friction
         if config.friction == "fixed":
-            return self.middle
+            return middle(self._task)
         angle, share = rng.uniform(-np.pi, np.pi, tokens), np.sqrt(rng.random(tokens))
         around = share[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return Unknowns(
@@ -129,12 +124,6 @@ class PushEnv(Env):
             float(rng.uniform(finger[0], finger[1])),
             config.centre * layout.radii[:, None] * around,
         )
-
-    def corners_of(self, poses: Floats, present: Bools) -> Floats:
-        """(V, 2) of poses (K, 3); AWAY those that are not on the table."""
-        corners = self._task.layout.corners(poses)
-        corners[~present[self._task.layout.token_of_corner]] = AWAY
-        return corners
 
     def _seen(self) -> Arrays:
         return {"corners": self.corners.copy(), "goals": self.goals.copy()}

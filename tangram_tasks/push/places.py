@@ -30,6 +30,13 @@ def on_table(corners: AnyArray, layout: Layout) -> Bools:
     return first
 
 
+def corners_of(layout: Layout, poses: Floats, present: Bools) -> Floats:
+    """(V, 2) of poses (K, 3); AWAY those that are not on the table."""
+    corners = layout.corners(poses)
+    corners[~present[layout.token_of_corner]] = AWAY
+    return corners
+
+
 def errors(layout: Layout, achieved: Floats, desired: Floats) -> tuple[Floats, Floats]:
     """(n, K) distances and turns (radians) from tokens to their places, up to their symmetry."""
     ways = layout.poses(desired) - layout.poses(achieved)

@@ -22,6 +22,7 @@ from tangram_sim.geometry.overlap import outlines_at, shared_area
 from tangram_sim.geometry.shapes import Shape
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.places import on_table, push_of
+from tangram_tasks.push.trials import Trials, middle
 
 if TYPE_CHECKING:
     from tangram_tasks.push.env import PushEnv
@@ -103,12 +104,13 @@ class Planner:
             knows: of friction and centres of mass: middle, of what they are drawn from; all; wrong,
                 the finger's friction and the lever of the table's twice the middle.
         """
-        middle, config = env.middle, task.config
+        self._middle, config = middle(task), task.config
         self._env, self._count, self._rounds, self._knows = env, tried, rounds, knows
-        self._table = PushTable(task.layout, config.finger)
+        self._trials = Trials(task)
         self._task, self._layout = task, task.layout
+        spread, friction = float(self._middle.spread[0]), self._middle.finger
         self._tried = [
-            tried_alone(one, config.finger, config.longest, middle.finger, float(middle.spread[0]))
+            tried_alone(one, config.finger, config.longest, friction, spread)
             for one in task.layout.shapes
         ]
         self._periods = 2.0 * np.pi / task.layout.symmetries
@@ -122,10 +124,10 @@ class Planner:
     def _known(self, table: int) -> Unknowns:
         if self._knows == "all":
             return self._env.unknowns[table]
-        middle = self._env.middle
+        own = self._middle
         if self._knows == "middle":
-            return middle
-        return replace(middle, spread=middle.spread * WRONG, finger=middle.finger * WRONG)
+            return own
+        return replace(own, spread=own.spread * WRONG, finger=own.finger * WRONG)
 
     def _best(
         self, corners: Floats, goals: Floats, knows: Unknowns, rng: np.random.Generator
@@ -149,8 +151,8 @@ class Planner:
         if not found:
             return np.zeros(4)
         if self._count > 1:
-            self._table.place(poses, present, knows)
-            scene = poses, corners, desired, present
+            self._trials.begin(corners, goals, knows)
+            scene = desired, present
             found = [(self._after(one, *scene), one) for _, one in found]
             for number in range(self._rounds):
                 best = sorted(found, key=_cost)[:BEST]
@@ -160,17 +162,12 @@ class Planner:
                 found += [(self._after(one, *scene), one) for one in others]
         return min(found, key=_cost)[1]
 
-    def _after(
-        self, action: Floats, poses: Floats, corners: Floats, desired: Floats, present: Bools
-    ) -> float:
+    def _after(self, action: Floats, desired: Floats, present: Bools) -> float:
         """What is left of all tokens after a push, tried in the engine: the least pushes first."""
-        config = self._task.config
-        push = push_of(self._layout, corners, action, config.finger, config.longest)
-        if push.refused:
+        corners = self._trials.after(action)
+        if corners is None:
             return BLOCKED
-        self._table.lay(poses)
-        self._table.push(push.begin, push.way)
-        now, whole = self._table.poses(), 0.0
+        now, whole = self._layout.poses(corners), 0.0
         for token in np.flatnonzero(present).tolist():
             error = _error(now[token], desired[token])
             cost = float(self._cost(token, error[None])[0])

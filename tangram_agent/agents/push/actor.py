@@ -3,6 +3,8 @@
 Legend: B environments, K tokens.
 """
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from torch import nn
@@ -10,12 +12,14 @@ from torch import nn
 from tangram_agent.agents.push.agent import PushingConfig
 from tangram_agent.agents.push.choosing import best
 from tangram_agent.agents.push.networks import Table, Twins
-from tangram_agent.agents.push.scenes import PUSHES, Tokens
+from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens
 from tangram_agent.base.acting import NetworkActor
-from tangram_core.arrays import Ints, Singles
-from tangram_core.spec import Arrays
+from tangram_core.arrays import Floats, Ints, Singles
+from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
+from tangram_tasks.push.places import on_table
 from tangram_tasks.push.task import Push
+from tangram_tasks.push.trials import Trials, middle
 
 CPU = torch.device("cpu")
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
@@ -44,25 +48,59 @@ class PushActor(NetworkActor):
 
         Where it explores, other pushes are drawn each time, and some are any.
         """
-        tokens = self._tokens
+        tokens, tried = self._tokens, self._config.tried
         corners, goals = seen["corners"], seen["goals"]
         scene = tokens.scene(corners, goals)
         drawn, any_push = self._drawn(len(corners), explore)
-        with torch.no_grad():
-            times = 1 if explore is not None else _SURE
-            looked_at = min(times * self._config.looked_at, PUSHES)
-            moved = self.network.table.moved
-            slots = torch.arange(self._task.count).expand(len(corners), -1)
-            found = best(self.network.critic, moved, tokens, scene, slots, drawn, looked_at)
-        chosen, pushes = (one.numpy().copy() for one in found[1:])
+        times = 1 if explore is not None else _SURE
+        most = max(1, tried) if explore is None else 1
+        _, slots, found = self._best(scene, drawn, times * self._config.looked_at, most)
+        which = scene.which.gather(1, slots)
+        if most > 1:
+            at = self._tried(corners, goals, tokens.actions[which.numpy(), found.numpy()])[:, None]
+            which, found = which.gather(1, at), found.gather(1, at)
+        chosen, pushes = (one[:, 0].numpy().copy() for one in (which, found))
         if explore is not None:
             other = any_push[:, 0] < self._config.uniform_share
             count = scene.present.sum(1).numpy()
-            chosen = np.where(other, (any_push[:, 1] * count).astype(np.int64), chosen)
+            slot = (any_push[:, 1] * count).astype(np.int64)
+            any_of = scene.which.numpy()[np.arange(len(slot)), slot]
+            chosen = np.where(other, any_of, chosen)
             pushes = np.where(other, (any_push[:, 2] * PUSHES).astype(np.int64), pushes)
-        which = scene.which.numpy()[np.arange(len(chosen)), chosen]
-        actions: Singles = tokens.actions[which, pushes].astype(np.float32)
+        actions: Singles = tokens.actions[chosen, pushes].astype(np.float32)
         return actions
+
+    def _best(
+        self, scene: Scene, drawn: torch.Tensor, looked_at: int, most: int
+    ) -> tuple[torch.Tensor, ...]:
+        """See `best`, of all tokens of every table."""
+        slots = torch.arange(self._task.count).expand(len(scene.present), -1)
+        network, count = self.network, min(looked_at, PUSHES)
+        with torch.no_grad():
+            moved = network.table.moved
+            return best(network.critic, moved, self._tokens, scene, slots, drawn, count, most)
+
+    def _tried(self, corners: Array, goals: Array, actions: Floats) -> torch.Tensor:
+        """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine."""
+        task, known = self._task, middle(self._task)
+        after = np.repeat(corners[:, None], actions.shape[1], axis=1)
+        for table in np.flatnonzero(~task.placed(corners, goals).all(axis=1)).tolist():
+            self._trials.begin(corners[table], goals[table], known)
+            for number, push in enumerate(actions[table]):
+                found = self._trials.after(push)
+                after[table, number] = corners[table] if found is None else found
+        flat, wanted = after.reshape(-1, *corners.shape[1:]), goals.repeat(actions.shape[1], axis=0)
+        placed = task.placed(flat, wanted)
+        drawn, _ = self._drawn(len(flat), None)
+        value, _, _ = self._best(self._tokens.scene(flat, wanted), drawn, self._config.looked_at, 1)
+        paid = task.paid(placed, on_table(wanted, task.layout))
+        goes_on = self._config.gamma * ~placed.all(axis=1)
+        worth = torch.from_numpy(paid) + torch.from_numpy(goes_on) * value[:, 0].clamp(max=0.0)
+        return worth.view(len(corners), -1).argmax(1)
+
+    @cached_property
+    def _trials(self) -> Trials:
+        return Trials(self._task)
 
     def _drawn(self, count: int, explore: Generators | None) -> tuple[torch.Tensor, Singles]:
         """(B * K, P) pushes to look at, and three numbers (B, 3) in [0, 1) for each environment."""

@@ -23,6 +23,13 @@ class PushingConfig(EpisodeConfig, section="agent"):
         low=2,
         high=1024,
     )
+    tried: int = setting(
+        0,
+        "of these, the best that it tries in an engine of its own, at the middle of the ranges of "
+        "friction, before one is played; 0: none, and none while it learns",
+        low=0,
+        high=1024,
+    )
     targets_looked_at: int = setting(
         8, "the same in the target of an update", low=2, high=1024, part=LEARNING
     )

@@ -23,10 +23,11 @@ def best(
     slots: Tensor,
     drawn: Tensor,
     count: int,
+    most: int = 1,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The best push of each table: its value (n,), the slot of its token (n,), and which (n,).
+    """The best pushes of each table: their values (n, M), slots of their tokens, and which.
 
-    One critic chooses, the lesser of both says what it is worth.
+    One critic chooses, the lesser of both says what they are worth.
 
     Args:
         critics: who value.
@@ -37,9 +38,9 @@ def best(
         drawn: (n * k, P) numbers of pushes.
         count: of pushes of each token that are looked at: the half after which least is left to go
             if it is alone, and the first that were drawn.
+        most: M.
     """
     size, each = slots.shape
-    rows = torch.arange(size, device=drawn.device)
     seen = seen_by(tokens, scene.repeated(each), slots.flatten())
     which = _looked_at(tokens, seen, moved, drawn, count)
     own = seen.which[:, None]
@@ -48,11 +49,12 @@ def best(
     )
     never = never | ~scene.present.gather(1, slots).flatten()[:, None]
     values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
-    value, at = values.max(1)
+    values, at = values.topk(most, dim=1) if most > 1 else values.max(1, keepdim=True)
     slot, push = at // count, at % count
-    row = rows * each + slot
-    other = critics.one(1, _only(seen, row), numbers[row, push][:, None])[:, 0]
-    return torch.minimum(value, other), slots[rows, slot], which[row, push]
+    row = torch.arange(size, device=drawn.device)[:, None] * each + slot
+    rows = row.flatten()
+    other = critics.one(1, _only(seen, rows), numbers[row, push].view(len(rows), 1, -1))
+    return torch.minimum(values, other.view_as(values)), slots.gather(1, slot), which[row, push]
 
 
 def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: int) -> Tensor:

@@ -230,7 +230,7 @@ class PushLearner(NetworkLearner):
         placed = tokens.placed(scene)
         first = seen.order + 2.0 * scene.present + (~placed & scene.present)
         slots = first.topk(min(_TOKENS, first.shape[1]), dim=1).indices
-        value, _, _ = best(critic, self.table.moved, tokens, scene, slots, seen.drawn, count)
+        value = best(critic, self.table.moved, tokens, scene, slots, seen.drawn, count)[0][:, 0]
         least = -1.0 / (1.0 - config.gamma)
         counts = scene.present.sum(1)
         reward = (placed & scene.present).sum(1) / counts - 1.0  # as the task pays it

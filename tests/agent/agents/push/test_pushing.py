@@ -8,6 +8,7 @@ import pytest
 import torch
 from shapely.geometry import Point, Polygon
 
+from tangram_agent.agents.push.actor import PushActor
 from tangram_agent.agents.push.agent import Pushing, PushingConfig
 from tangram_agent.agents.push.learner import PushLearner, PushReplay
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, distance, gap, rotated
@@ -20,6 +21,7 @@ from tangram_core.task import Generators, Played
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_tasks.push.places import push_of
 from tangram_tasks.push.task import Push, PushConfig
+from tangram_tasks.push.trials import Trials, middle
 from tests.agent.builders import PAIR, setup
 from tests.sim.builders import SEVEN
 
@@ -147,6 +149,25 @@ def test_pushes_that_are_looked_at_are_those_that_the_table_makes() -> None:
     assert 10 < refused < 600
 
 
+def test_a_push_that_is_tried_in_the_engine_is_known_to_lead_home() -> None:
+    actor = Pushing(SMALL).actor(TWO)
+    assert isinstance(actor, PushActor)
+    with closing(TWO.make(3)) as env:
+        corners = env.reset(generators("test", 0, 3))["corners"]
+        goals = corners.copy()
+        home = [[-0.9, 0.1, 0.3], [-0.1, 0.2, -0.3], [0.6, -0.3, 0.3]]  # pushes of the square
+        actions = np.tile([0.7, 0.4, 0.5, 0.9], (3, 4, 1))  # others, of the triangle
+        trials, place = Trials(TWO), [1, 3, 0]
+        for table in range(3):
+            actions[table, place[table]] = -0.5, *home[table]
+            trials.begin(corners[table], goals[table], middle(TWO))
+            after = trials.after(actions[table, place[table]])
+            assert after is not None
+            goals[table] = after
+    assert not TWO.placed(corners, goals).all(axis=1).any()
+    assert actor._tried(corners, goals, actions).tolist() == place
+
+
 def test_hindsight_takes_whole_tokens_of_what_was_reached() -> None:
     replay, layout = PushReplay(SOME, 100), SOME.layout
     replay.some_share = 0.5
@@ -173,7 +194,7 @@ def test_targets_pay_and_end_as_the_task_does(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(learner.replay, "chosen", lambda *a: chosen.setdefault("found", real(*a)))
     monkeypatch.setattr(
         "tangram_agent.agents.push.learner.best",
-        lambda *a: (torch.full((100,), -1.0), None, None),
+        lambda *a: (torch.full((100, 1), -1.0), None, None),
     )
     targets = learner._target(learner.drawn(rng)).numpy()
     rows, steps, desired = chosen["found"]
