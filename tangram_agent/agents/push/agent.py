@@ -31,7 +31,7 @@ class PushingConfig(EpisodeConfig, section="agent"):
         high=1024,
     )
     targets_looked_at: int = setting(
-        16, "the same in the target of an update", low=2, high=1024, part=LEARNING
+        8, "the same in the target of an update", low=2, high=1024, part=LEARNING
     )
     some_share: float = setting(
         0.3,
