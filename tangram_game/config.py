@@ -28,7 +28,7 @@ MAX_SEED = 2**63 - 1
 PUZZLE_FILES = (".json", ".svg")
 PUZZLE_HELP = (
     "instead of random targets: puzzles by name, as cat or [cat,dog], all of the library's train, "
-    "test or paper, or a JSON or SVG file of your own; [mine.json,cat] is one of a file"
+    "test or paper, or a JSON file of your own; [mine.json,cat] is one of a file"
 )
 TURNS_HELP = "each puzzle at so many angles, evenly spread; 1 is as drawn"
 

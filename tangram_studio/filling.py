@@ -35,7 +35,7 @@ from tangram_vision.given.silhouette_files import PICTURES, Silhouette, fill_sil
 from tangram_vision.silhouettes.approximations import nearest_figure
 from tangram_vision.silhouettes.silhouettes import Method, silhouette
 
-SUFFIXES = (*PICTURES, ".svg", ".json")
+SUFFIXES = (*PICTURES, ".json")
 SECONDS = 5.0  # of a search,
 FREE_SECONDS = 1.0  # where sides are not straight, so that hardly anything fits,
 NEAREST_SECONDS = 2.5  # and of what comes nearest

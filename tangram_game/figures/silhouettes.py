@@ -119,7 +119,7 @@ def why_unfilled(drawn: "Silhouette", layout: Layout) -> str:
         )
     return (
         f"was not filled with {tokens} in {filled.seconds:.1f} s ({best}): draw sides that are "
-        "straight, or give a larger picture or its outline as SVG"
+        "straight, or give a larger picture, or its outline as JSON"
     )
 
 

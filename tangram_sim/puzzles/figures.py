@@ -1,6 +1,6 @@
 """Puzzles that people know: figures of the seven tans, from files and from the package's library.
 
-A file is JSON (see `sketches`) or SVG (see `svg`) and drawn by hand to about a hundredth of a unit.
+A file is JSON (see `sketches`) and drawn by hand to about a hundredth of a unit.
 Each piece becomes the exact tan that fits best. Pieces that overlap a little are pushed apart; gaps
 stay as they are drawn.
 """
@@ -13,8 +13,7 @@ from pathlib import Path
 
 from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.assembly import Puzzle, PuzzleRules, build_puzzle
-from tangram_sim.puzzles.sketches import FaultError, Sketch, parse_sketches, read_text
-from tangram_sim.puzzles.svg import parse_svg
+from tangram_sim.puzzles.sketches import Sketch, parse_sketches, read_text
 
 PACKAGED: Traversable = files("tangram_sim") / "puzzles"
 SPLITS = ("train", "test", "paper")
@@ -22,30 +21,23 @@ _MAX_TOLD = 20  # faults in one message
 
 
 def read_puzzles(path: Path, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
-    """The puzzles of a file: one if its name ends in .svg, JSON otherwise; by default of all tans.
+    """The puzzles of a JSON file; by default of all tans.
 
     Raises:
         ConfigError: the file cannot be used, or has faults; all of them are named.
     """
-    text = read_text(path)
     if path.suffix.lower() == ".svg":
-        return parse_svg_puzzle(text, path.stem, rules)
+        raise ConfigError(
+            f"puzzle={path} is a drawing, which tells no pieces: fill it by silhouette={path}, or "
+            "write the pieces into a JSON file"
+        )
+    text = read_text(path)
     return parse_puzzles(text, f"puzzle file {path.name}", rules)
 
 
 def parse_puzzles(text: str, source: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
     """The puzzles of a JSON text, which errors call `source`; see `read_puzzles`."""
     return _built(parse_sketches(text, source), rules or PuzzleRules())
-
-
-def parse_svg_puzzle(text: str, name: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
-    """The one puzzle of an SVG text; see `read_puzzles`."""
-    sketch: Sketch | list[str]
-    try:
-        sketch = parse_svg(text, name)
-    except FaultError as fault:
-        sketch = [str(fault)]
-    return _built([sketch], rules or PuzzleRules())
 
 
 def _built(sketches: Sequence[Sketch | list[str]], rules: PuzzleRules) -> tuple[Puzzle, ...]:

@@ -1,7 +1,7 @@
 """A silhouette that is drawn, in a file or in the library -> its area, read without trust.
 
-A file is an SVG of outlines, or of pieces that make them up; a puzzle, whose pieces are forgotten;
-or JSON: {"format": "tangram-outlines", "version": 1, "outlines": [[[x, y], ...], ...], "side": 1},
+A file is a puzzle, whose pieces are forgotten, or JSON:
+{"format": "tangram-outlines", "version": 1, "outlines": [[[x, y], ...], ...], "side": 1},
 lengths in any unit, y up. An outline that lies in another is a hole in it. The side may be left
 out; it is that of the full square that the tans are cut from, and tells the scale.
 """
@@ -31,7 +31,6 @@ from tangram_sim.puzzles.sketches import (
     read_text,
     shown,
 )
-from tangram_sim.puzzles.svg import svg_outlines
 
 FORMAT, VERSION = "tangram-outlines", 1
 MAX_OUTLINES = 100
@@ -61,15 +60,13 @@ def read_outline(name: str, source: str) -> Drawn:
     """What a file draws, or a puzzle of the library.
 
     Args:
-        name: of the file, JSON or SVG, or of the puzzle.
+        name: of the JSON file, or of the puzzle.
         source: what errors call it.
 
     Raises:
         ConfigError: it cannot be used.
     """
     path, kind = Path(name), Path(name).suffix.lower()
-    if kind == ".svg":
-        return Drawn(_joined(svg_outlines(read_text(path, source), path.stem), source), None)
     if kind != ".json":
         return _of_puzzle(load_puzzle(name, 1.0), source)
     text = read_text(path, source)

@@ -1,4 +1,4 @@
-"""A picture file that a person gives, read without trust: PNG or JPEG -> a picture in colour."""
+"""A picture file that a person gives, read without trust: PNG, JPEG or SVG -> one in colour."""
 
 import struct
 import warnings
@@ -9,6 +9,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.sketches import check_file
+from tangram_vision.given.svg_files import read_svg
 
 FORMATS = ("PNG", "JPEG")
 MAX_MEGAPIXELS = 64
@@ -27,9 +28,11 @@ def read_picture(path: Path, source: str) -> Image.Image:
         source: what errors call it.
 
     Raises:
-        ConfigError: no file, not a PNG or JPEG that can be read, too large or too small.
+        ConfigError: no file, not a PNG, JPEG or SVG that can be read, too large or too small.
     """
     check_file(path, source)
+    if path.suffix.lower() == ".svg":
+        return _upright(read_svg(path, source))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

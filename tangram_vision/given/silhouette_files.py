@@ -1,6 +1,6 @@
 """A silhouette from a file or by name -> where a layout's tokens lie that fill it.
 
-A file is a PNG or JPEG of it, dark on light or the reverse, or draws its outline. Its place and its
+A file is a picture of it, dark on light or the reverse, or tells its outline. Its place and its
 angle are free, and so is its scale: the area tells it, and must be the tokens' where the file tells
 it, too.
 
@@ -40,7 +40,7 @@ _DRAWN = 640  # pixels along the longer side of an outline that is drawn
 _BORDER = 0.1  # of it, around the outline
 _INK, _PAPER = (55, 60, 68), (250, 250, 247)
 _OFF = 0.05  # of the tokens' area, by which that of a drawing of known scale may be wrong
-PICTURES = (".png", ".jpg", ".jpeg")
+PICTURES = (".png", ".jpg", ".jpeg", ".svg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def fill_silhouette(
     if count > 1:
         raise ConfigError(
             f"solutions={count} needs an exact outline, and {source} is a picture, whose pixels "
-            "are fitted by one: leave solutions out, or draw the outline as SVG or JSON"
+            "are fitted by one: leave solutions out, or write the outline as JSON"
         )
     return _from_picture(read_picture(path, source), source, layout, seconds, method)
 

@@ -101,7 +101,7 @@ def test_a_file_that_is_not_filled_is_refused_in_one_line(running: Running) -> N
         ("a.exe", b"MZ", "cannot be read: drop one of .png"),
         ("a", b"", "cannot be read"),
         ("a.png", b"", "no PNG or JPEG"),
-        ("a.svg", SVG.format("<script>alert(1)</script>").encode(), "draws no polygon"),
+        ("a.svg", SVG.format("<script>alert(1)</script>").encode(), "draws nothing"),
         ("a.json", b"{" * 100_000, "not JSON"),
     ):
         status, content = running.drop(name, data)

@@ -1,6 +1,7 @@
 """Files of what was played are what other commands read."""
 
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,30 +9,33 @@ from PIL import Image
 
 from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.assembly import PuzzleRules
-from tangram_sim.puzzles.figures import parse_puzzles, parse_svg_puzzle
+from tangram_sim.puzzles.figures import parse_puzzles
 from tangram_sim.targets.targets import placement
 from tangram_studio import saving
 from tangram_studio.playing import Sides, begin, next_move, player
 from tangram_studio.saving import FRAMES, gif, puzzle_file, svg
+from tangram_vision.given.svg_files import read_svg
 from tests.studio.test_playing import figure
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("name", ["cat", "swan"])
-def test_a_puzzle_file_and_an_svg_have_the_tokens_where_they_lie(name: str) -> None:
+def test_a_puzzle_file_and_an_svg_have_the_tokens_where_they_lie(name: str, tmp_path: Path) -> None:
     goal, layout = figure(name), player("lift").layout
-    saved = parse_puzzles(puzzle_file(goal, "mine").decode(), "saved", PuzzleRules(0.6))
-    drawn = parse_svg_puzzle(svg(goal).decode(), "mine", PuzzleRules(0.6))
-    for found in (saved, drawn):
-        (puzzle,) = found
-        poses, flipped = placement(puzzle, layout)
-        assert puzzle.name == "mine"
-        corners = layout.corners(poses, flipped)
-        wanted = layout.corners(*goal)
-        # As sets: equal tokens may have changed places, and symmetric ones turned.
-        far = np.linalg.norm(corners[:, None] - wanted[None], axis=-1)
-        assert far.min(axis=1).max() < 2e-3
+    (puzzle,) = parse_puzzles(puzzle_file(goal, "mine").decode(), "saved", PuzzleRules(0.6))
+    poses, flipped = placement(puzzle, layout)
+    assert puzzle.name == "mine"
+    corners, wanted = layout.corners(poses, flipped), layout.corners(*goal)
+    # As sets: equal tokens may have changed places, and symmetric ones turned.
+    far = np.linalg.norm(corners[:, None] - wanted[None], axis=-1)
+    assert far.min(axis=1).max() < 2e-3
+    (tmp_path / "mine.svg").write_bytes(svg(goal))
+    picture = read_svg(tmp_path / "mine.svg", "mine.svg").getchannel("A").getbbox()
+    extent = np.ptp(wanted, axis=0)
+    assert picture is not None
+    wide, high = picture[2] - picture[0], picture[3] - picture[1]
+    assert wide / high == pytest.approx(extent[0] / extent[1], rel=0.02)
 
 
 def test_tokens_on_each_other_are_no_puzzle() -> None:

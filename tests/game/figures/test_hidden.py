@@ -278,7 +278,7 @@ def test_pictures_are_told(
     def formula(_: Env) -> Chooser:
         return exact_policy(game(PICTURE).layout, game(PICTURE).sim)
 
-    monkeypatch.setattr("tangram_game.evaluate.policies", lambda _: {RUN: formula})
+    monkeypatch.setattr("tangram_game.evaluate.policies", lambda *_: {RUN: formula})
     report = evaluated(tmp_path, PICTURE, "square")
     assert report["iou"] > 0.95
     assert "grey pictures of 128 px, pieces hidden" in " ".join(capsys.readouterr().out.split())

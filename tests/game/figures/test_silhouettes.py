@@ -130,25 +130,24 @@ def test_an_agent_of_outlines_has_one_solution(filler: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("outlines", "message"),
     [
-        (
-            ('<path d="M 1 1 H 9 V 3 H 1 Z"/>',),
-            r"cannot be filled with .*\(no dissection: all ways were tried, ",
-        ),
-        (('<path d="M 1 1 L 9 9 Z"/>',), "draws no polygon|nothing that has an area"),
-        ((), "draws no polygon"),
+        ([[[1, 1], [9, 1], [9, 3], [1, 3]]], r"cannot be filled with .*\(no dissection: all ways"),
         # A square within another is a hole; no tans make a frame of that width.
-        ((SQUARE, '<path d="M 2 2 H 8 V 8 H 2 Z"/>'), "cannot be filled"),
-        (('<path d="M 1 1 H 9 V 9 H 1 Z"/>' * 17,), "more than 16 polygons"),
-        (('<path d="M 1 1 C 9 9 9 9 1 1 Z"/>',), "M, L, H, V, Z"),
+        (
+            [[[1, 1], [9, 1], [9, 9], [1, 9]], [[2, 2], [8, 2], [8, 8], [2, 8]]],
+            "cannot be filled",
+        ),
     ],
+    ids=["bar", "frame"],
 )
 def test_an_outline_that_cannot_be_filled_is_refused(
-    tmp_path: Path, content: tuple[str, ...], message: str
+    tmp_path: Path, outlines: list[list[list[int]]], message: str
 ) -> None:
+    path = tmp_path / "it.json"
+    path.write_text(json.dumps({"format": "tangram-outlines", "version": 1, "outlines": outlines}))
     with pytest.raises(ConfigError, match=message):
-        read(svg(tmp_path / "it.svg", *content))
+        read(str(path))
 
 
 def test_a_puzzle_file_of_one_is_filled_and_one_of_more_is_refused(tmp_path: Path) -> None:
