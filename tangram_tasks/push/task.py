@@ -123,12 +123,6 @@ class Push(Task):
                 f"task.count={self.config.count} of {self.layout.tokens} tokens: set it to at most "
                 f"{self.layout.tokens}, or take a larger set, as in tokens=tangram7"
             )
-        fewer = self.config.fewer
-        if fewer and (len(fewer) > self.count or not sum(fewer)):
-            raise ConfigError(
-                f"task.fewer={[*fewer]} must have a weight above 0, and at most one for each of "
-                f"{self.count} tokens: write it as [0,1,1] for two tokens and three, as often"
-            )
 
     @cached_property
     def layout(self) -> Layout:
@@ -188,7 +182,13 @@ class Push(Task):
         return np.asarray(self.placed(achieved, desired).all(axis=1))
 
     def check(self, *, plays: bool) -> None:
-        """Refuse tokens that have no room, and to play where there is no engine."""
+        """Refuse tokens without room, weights of none, and to play where there is no engine."""
+        fewer = self.config.fewer
+        if fewer and (len(fewer) > self.count or not sum(fewer)):
+            raise ConfigError(
+                f"task.fewer={[*fewer]} must have a weight above 0, and at most one for each of "
+                f"{self.count} tokens: write it as [0,1,1] for two tokens and three, as often"
+            )
         begin(self.layout, self.count, np.random.default_rng(0), self.figures)
         if plays and find_spec("pybullet") is None:
             raise ConfigError("task=push needs PyBullet, which is missing: pip install pybullet")
