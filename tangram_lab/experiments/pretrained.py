@@ -1,7 +1,7 @@
 """Making the agents that come with the package, from finished runs of several seeds.
 
 `python -m tangram_lab.experiments.pretrained square runs/seeds/square/seed_*` puts the seed with
-the median reward into `tangram_agent/pretrained/square`, with a card that tells the scores of all
+the median score into `tangram_agent/pretrained/square`, with a card that tells the scores of all
 seeds.
 """
 
@@ -10,7 +10,6 @@ import hashlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,13 +29,16 @@ from tangram_game.evaluate import policies, score_policies
 from tangram_game.figures.puzzles import by, find_figures
 from tangram_game.scores import RUN, score_puzzles
 from tangram_sim.targets.targets import has_all_tans
+from tangram_tasks.place import Place
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
 RESULT = "result.json"
 MAX_BYTES = 1_000_000  # of the weights: they travel with every installation
 FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of each figure
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
-BEAM = 12  # of an agent of outlines, as it ships
+# What an agent looks ahead by as it ships, and does not in training.
+AHEAD = {"outline": {"beam": 12}, "push": {"tried": 16}}
+DEAR = ("planner", "planner_told", "planner_wrong")  # rivals that would take hours
 
 
 class Candidate(NamedTuple):
@@ -51,8 +53,8 @@ def publish(
 ) -> Path:
     """Write the folder of an agent: the run of the median seed, and a card about all of them.
 
-    The median is that of the final mean reward, the lower one of two; the best seed would promise
-    more than another training gives.
+    The median is that of the final score, the lower one of two; the best seed would promise more
+    than another training gives.
 
     Args:
         run_dirs: finished runs of one setup, one for each seed.
@@ -73,15 +75,17 @@ def publish(
     seeds = sorted((_read(path) for path in run_dirs), key=lambda one: int(one.result["seed"]))
     _check_one_setup(seeds)
     chosen = median(seeds)
-    if chosen.run.setup.agent_kind == "outline":  # looks ahead, which it does not in training
-        chosen = chosen._replace(run=chosen.run.with_settings({"agent": {"beam": BEAM}}))
+    if ahead := AHEAD.get(chosen.run.setup.agent_kind):
+        chosen = chosen._replace(run=chosen.run.with_settings({"agent": ahead}))
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
-    scores = score_policies(chosen.run.task, policies(chosen.run), config, chosen.run.actor.at_once)
+    players = {name: one for name, one in policies(chosen.run).items() if name not in DEAR}
+    task = chosen.run.setup.task
+    scores = score_policies(task, players, config, chosen.run.actor.at_once)
     card = make_card(name, chosen, seeds)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
-    task = chosen.run.task
-    if has_all_tans(task.layout) and task.sim.observe != "pictures":  # of pieces that touch
+    places = isinstance(task, Place) and task.sim.observe != "pictures"  # pieces that touch
+    if isinstance(task, Place) and places and has_all_tans(task.layout):
         card |= {"puzzles": {split: _on_figures(chosen.run, split) for split in FIGURES}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}
     folder = target / name
@@ -102,9 +106,14 @@ def _on_figures(run: Run, split: str) -> dict[str, Any]:
 
 
 def median(seeds: Sequence[Candidate]) -> Candidate:
-    """The seed in the middle by its final mean reward; of two, the lower one."""
-    ranked = sorted(seeds, key=lambda one: float(one.result["mean_reward"]))
+    """The seed in the middle by its final score; of two, the lower one."""
+    ranked = sorted(seeds, key=lambda one: float(one.result[_ranks(one.result)]))
     return ranked[(len(ranked) - 1) // 2]
+
+
+def _ranks(result: Mapping[str, Any]) -> str:
+    """The score by which runs are ranked."""
+    return "mean_reward" if result.get("solved") is None else "solved"
 
 
 def _read(run_dir: Path) -> Candidate:
@@ -113,8 +122,8 @@ def _read(run_dir: Path) -> Candidate:
         result = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
         raise RunError(f"cannot read {path}: name the folder of a finished run") from None
-    if not isinstance(result, dict) or result.get("mean_reward") is None:
-        raise RunError(f"{path} holds no mean_reward: train it with an evaluator")
+    if not isinstance(result, dict) or result.get(_ranks(result)) is None:
+        raise RunError(f"{path} holds no {_ranks(result)}: train it with an evaluator")
     run = load_run(run_dir)
     if not result["scored_updates"] == result["updates"] == run.updates:
         raise RunError(
@@ -164,6 +173,9 @@ _BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "work
 
 # Scores of the card's tables: name -> label, digits.
 _ROWS = {
+    "solved": ("all tokens in place, share of tests", 3),
+    "placed": ("tokens in place, share", 3),
+    "pushes": ("pushes", 1),
     "mean_reward": ("mean reward, exact polygons, -1 to 1", 4),
     "raw_overlap": ("coverage, 0 to 1", 4),
     "raw_overlap_p10": ("coverage, 10th percentile", 4),
@@ -183,20 +195,21 @@ def make_card(name: str, chosen: Candidate, seeds: Sequence[Candidate]) -> dict[
         chosen: the run that ships.
         seeds: all runs, by seed.
     """
-    task, setup, result = chosen.run.task, chosen.run.setup, chosen.result
+    setup, result = chosen.run.setup, chosen.result
+    world = setup.config()
     acting = sum(tensor.size for tensor in chosen.run.weights.tensors.values())
     return {
         "format": FORMAT,
         "name": name,
         "licence": "MIT",
-        "tokens": [shape.name for shape in task.layout.shapes],
-        "scale": task.tokens.scale,
+        "tokens": list(world["tokens"]["shapes"]),
+        "scale": world["tokens"]["scale"],
         **setup.agent.facts(),
-        "sim": {key: told(value) for key, value in asdict(task.sim).items()},
+        "sim": {key: told(value) for key, value in world.get("sim", world["task"]).items()},
         "parameters": {"acting": acting, "trained": result["parameters"]},
         "budget": _picked(result, *_BUDGET),
         **_picked(result, "updates", "seed", "episodes", "transitions", "test_episodes"),
-        "selection": "median of the seeds by final mean_reward (the lower one of two)",
+        "selection": f"median of the seeds by final {_ranks(result)} (the lower one of two)",
         "seeds": [
             {key: one.result.get(key) for key in ("seed", "train_s", *_ROWS)} for one in seeds
         ],

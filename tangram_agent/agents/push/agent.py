@@ -75,5 +75,5 @@ class Pushing(Agent):
         return PushLearner(cast("Push", task), self.config, seed, device, compiled=compiled)
 
     def facts(self) -> Json:
-        """Its name."""
-        return {"agent": "push"}
+        """Its name, and that of its network."""
+        return {"agent": "push", "net": f"sums of {self.config.width}"}
