@@ -15,6 +15,7 @@ from tangram_lab.benchmarks.measure import Bound, compared, rates, single
 from tangram_lab.benchmarks.speed import fetch
 from tangram_lab.benchmarks.speed.fetch import Curve, Match, measure_fetch
 from tangram_lab.benchmarks.speed.learner import measure_gpu
+from tangram_lab.benchmarks.speed.pushes import PUSHES, _ways
 from tangram_lab.benchmarks.stages import STAGES, run_stages
 
 LABELS = ("stage", "case", "unit")
@@ -111,6 +112,12 @@ def test_all_is_all_that_needs_no_gpu_and_no_robots(monkeypatch: pytest.MonkeyPa
         monkeypatch.setitem(STAGES, name, lambda _, one=row: measured.append(one.stage) or [one])
     assert run_stages(argparse.Namespace(kind="all", out=None)) == 0
     assert {*STAGES} - {*measured} == {"gpu", "fetch"}
+
+
+@pytest.mark.fast
+def test_as_many_pushes_are_made_inside_the_engine_as_step_by_step() -> None:
+    ours, theirs = _ways(2)
+    assert ours() == theirs() == PUSHES
 
 
 @pytest.mark.fast
