@@ -70,7 +70,7 @@ def push_of(
         return Push(begin, way, f"token {token} is not on the table")
     if not way.any():
         return Push(begin, way, "the table ends there")
-    clear = _distances(layout, corners, begin)
+    clear = apart(corners[layout.padded_corners] @ (1.0, 1j), begin @ (1.0, 1j))
     clear[token] = np.inf
     if clear.min() < finger:
         return Push(begin, way, f"token {int(clear.argmin())} is in the way")
@@ -122,16 +122,13 @@ def _on_edge(corners: AnyArray, shares: Floats) -> tuple[AnyArray, AnyArray]:
     return points, along * 1j
 
 
-def _distances(layout: Layout, corners: Floats, point: Floats) -> Floats:
-    """(K,) from a point to each token, 0 inside."""
-    outline = corners[layout.padded_corners] @ (1.0, 1j)
-    edges = np.roll(outline, -1, axis=1) - outline
-    to = (point @ (1.0, 1j)) - outline
+def apart(outlines: AnyArray, points: AnyArray) -> Floats:
+    """(...) from points (...) to convex polygons (..., C), 0 inside; all complex numbers."""
+    edges, to = np.roll(outlines, -1, axis=-1) - outlines, points[..., None] - outlines
     squares = np.abs(edges) ** 2
     share = np.clip((edges.conj() * to).real / np.where(squares > 0.0, squares, 1.0), 0.0, 1.0)
-    apart = np.abs(to - share * edges).min(axis=1)
-    inside = ((edges.conj() * to).imag >= 0.0).all(axis=1) & (squares.sum(axis=1) > 0.0)
-    found: Floats = np.where(inside, 0.0, apart)
+    inside = ((edges.conj() * to).imag >= 0.0).all(axis=-1) & (squares.sum(axis=-1) > 0.0)
+    found: Floats = np.where(inside, 0.0, np.abs(to - share * edges).min(axis=-1))
     return found
 
 

@@ -21,7 +21,7 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines_at, shared_area
 from tangram_sim.geometry.shapes import Shape
 from tangram_sim.world.pushing import PushTable, Unknowns
-from tangram_tasks.push.places import on_table, push_of
+from tangram_tasks.push.places import apart, on_table, push_of
 from tangram_tasks.push.trials import Trials, middle
 
 if TYPE_CHECKING:
@@ -236,14 +236,3 @@ def _moved(action: Floats, by: Floats) -> Floats:
     """Another push (4,) of the same token; where its edge ends it begins."""
     where, turn, far = action[1:] + by
     return np.array([action[0], (where + 1.0) % 2.0 - 1.0, *np.clip((turn, far), -1.0, 1.0)])
-
-
-def apart(outline: Floats, points: Floats) -> Floats:
-    """(n,) distances of points to a convex polygon (C,), 0 inside; both complex numbers."""
-    edges = np.roll(outline, -1) - outline
-    squares = np.abs(edges) ** 2
-    to = points[:, None] - outline
-    share = np.clip((edges.conj() * to).real / np.where(squares > 0.0, squares, 1.0), 0.0, 1.0)
-    inside = ((edges.conj() * to).imag >= 0.0).all(axis=1)
-    found: Floats = np.where(inside, 0.0, np.abs(to - share * edges).min(axis=1))
-    return found

@@ -22,13 +22,13 @@ def measure_pushes(runs: int) -> list[Row]:
     rows = []
     for count in COUNTS:
         labels = "sim", f"{count} of the seven tans", "pushes/s"
-        ours, theirs = _ways(count)
+        _, ours, theirs = ways(count)
         rows.append(compare(labels, ours, ("a bare loop", theirs), runs))
     return rows
 
 
-def _ways(count: int) -> tuple[Work, Work]:
-    """The same pushes of one laid table, made by `PushTable` and step by step."""
+def ways(count: int) -> tuple[PushTable, Work, Work]:
+    """A table, and the same pushes on it by `PushTable` and step by step."""
     task = Push(TokensConfig((*TANS, "parallelogram"), 0.6), PushConfig(count=count))
     table, layout, rng = PushTable(task.layout, 0.04), task.layout, np.random.default_rng(0)
     tokens, starts, _ = begin(layout, count, rng)
@@ -74,4 +74,4 @@ def _ways(count: int) -> tuple[Work, Work]:
                 pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
         return PUSHES
 
-    return ours, theirs
+    return table, ours, theirs
