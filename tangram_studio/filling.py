@@ -31,11 +31,12 @@ from tangram_sim.targets.targets import placement, turned_figure
 from tangram_studio.messages import Fill
 from tangram_studio.playing import Sides, player
 from tangram_vision.given.outline_files import FORMAT, VERSION
-from tangram_vision.given.silhouette_files import PICTURES, Silhouette, fill_silhouette
+from tangram_vision.given.picture_files import SUFFIXES
+from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
 from tangram_vision.silhouettes.approximations import nearest_figure
 from tangram_vision.silhouettes.silhouettes import Method, silhouette
 
-SUFFIXES = (*PICTURES, ".json")
+FILES = (*SUFFIXES, ".json")
 SECONDS = 5.0  # of a search,
 FREE_SECONDS = 1.0  # where sides are not straight, so that hardly anything fits,
 NEAREST_SECONDS = 2.5  # and of what comes nearest
@@ -108,10 +109,10 @@ def fill_file(name: str, data: bytes, who: str) -> Answer:
         ConfigError: it cannot be used.
     """
     suffix = Path(name).suffix.lower()
-    if suffix not in SUFFIXES:
+    if suffix not in FILES:
         raise ConfigError(
             f"a file of the kind '{suffix or name[:40]}' cannot be read: drop one of "
-            f"{', '.join(SUFFIXES)}"
+            f"{', '.join(FILES)}"
         )
     with TemporaryDirectory(prefix="tangram-studio-") as folder:
         path = Path(folder) / f"file{suffix}"

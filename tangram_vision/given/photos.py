@@ -35,6 +35,7 @@ _AROUND = 3  # pixels around one area
 _MANY = 40  # areas whose shapes are told
 _SIZE = 1.6  # times that an area may be larger or smaller than the token that it looks like
 _LIKE = 0.25  # moments nearer than this make an area look like a token
+_CLEAN = 12  # levels between ground and tokens that are enough where the ground has no noise
 _POINTS = 100  # of the light along a side
 _BORDER = 5  # points of the light from each side that show the ground
 _ROUNDS = 24
@@ -115,6 +116,10 @@ def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
     """
     cover = _coverage(np.asarray(picture.convert("L")))
     spots = _spots(cover, layout, source)
+    if spots.cut:
+        raise ConfigError(
+            f"{source} is cut off: a part of it reaches the picture's edge, leave ground around it"
+        )
     part, corner = spots.cut_out()
     above, back = from_above(part)
     size = np.diag([len(above), len(above), 1.0])
@@ -128,8 +133,8 @@ def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":
         at_edge = f" but what reaches its edge ({spots.cut})" if spots.cut else ""
         raise ConfigError(
             f"{source} shows nothing{at_edge} that is darker or lighter than its ground by "
-            f"{MIN_CONTRAST} of 255 levels: take it with dark tokens on light ground, or light "
-            "ones on dark"
+            f"{_CLEAN} of 255 levels, {MIN_CONTRAST} where that is uneven: take it with dark "
+            "tokens on light ground, or light ones on dark"
         )
     return spots
 
@@ -192,7 +197,8 @@ def _coverage(levels: Pixels) -> Singles:
     """(H, W) about 0 on the ground, and about 1 on tokens, each by its own level."""
     grey = cv2.GaussianBlur(levels, (3, 3), 0).astype(np.float32)
     light, noise = _light(grey)
-    least = max(MIN_CONTRAST / 2.0, 4.0 * noise)
+    contrast = MIN_CONTRAST if noise > 1.0 else _CLEAN
+    least = max(contrast / 2.0, 4.0 * noise)
     differs = light - grey
     if np.count_nonzero(differs < -least) > np.count_nonzero(differs > least):  # a dark ground
         differs = -differs
@@ -203,7 +209,7 @@ def _coverage(levels: Pixels) -> Singles:
         own = _window(stats[spot], cover.shape)
         here = label[own] == spot
         level = float(np.percentile(differs[own][here], 75))
-        if level >= MIN_CONTRAST:
+        if level >= contrast:
             near = cv2.dilate(here.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
             share = np.clip(0.5 + _STEEP * (differs[own] / level - 0.5), 0.0, 1.0)
             cover[own] = np.maximum(cover[own], np.where(near, share, 0.0))

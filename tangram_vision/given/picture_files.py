@@ -1,4 +1,4 @@
-"""A picture file that a person gives, read without trust: PNG, JPEG or SVG -> one in colour."""
+"""A picture file that a person gives, read without trust -> a picture in colour."""
 
 import struct
 import warnings
@@ -11,11 +11,17 @@ from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.sketches import check_file
 from tangram_vision.given.svg_files import read_svg
 
-FORMATS = ("PNG", "JPEG")
+# Those of them that Pillow reads by itself; EPS, say, starts another program.
+FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "TIFF", "BMP", "AVIF", "PPM")
+SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".webp", ".gif", ".tif", ".tiff", ".bmp", ".avif", ".ppm", ".svg"),
+    *(".heic", ".heif", ".pdf"),  # refused, and told as what
+)
 MAX_MEGAPIXELS = 64
 MIN_SIDE = 32
 LONGEST = 1280  # pixels of the longer side that are looked at
-_PAPER = (255, 255, 255)  # behind what is transparent
+_PAPER, _SLATE = (255, 255, 255), (0, 0, 0)  # behind what is transparent and dark, and light
+_LIGHT = 200  # mean level of what is light
 # What Pillow raises where a file is not what it says.
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, struct.error)
 
@@ -28,7 +34,7 @@ def read_picture(path: Path, source: str) -> Image.Image:
         source: what errors call it.
 
     Raises:
-        ConfigError: no file, not a PNG, JPEG or SVG that can be read, too large or too small.
+        ConfigError: no file, none of `FORMATS` or SVG that can be read, too large or too small.
     """
     check_file(path, source)
     if path.suffix.lower() == ".svg":
@@ -44,8 +50,9 @@ def read_picture(path: Path, source: str) -> Image.Image:
         raise ConfigError(_too_large(source)) from None
     except _BROKEN as error:
         why = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"
+        kind = path.suffix[1:].upper() if path.suffix.lower() in SUFFIXES else "picture"
         raise ConfigError(
-            f"{source} is no PNG or JPEG that can be read{why}: save it anew as PNG or JPEG"
+            f"{source} is no {kind} that can be read{why}: save it anew as PNG or JPEG"
         ) from None
 
 
@@ -73,6 +80,9 @@ def _upright(image: Image.Image) -> Image.Image:
     image.thumbnail((LONGEST, LONGEST), Image.Resampling.BOX)
     image = ImageOps.exif_transpose(image)
     if image.mode == "RGBA":
-        paper = Image.new("RGBA", image.size, _PAPER)
+        levels = np.asarray(image.convert("LA"), np.float64)
+        there = levels[..., 1].sum() or 1.0
+        light = there < levels[..., 1].size * 255.0 and levels.prod(axis=-1).sum() / there > _LIGHT
+        paper = Image.new("RGBA", image.size, _SLATE if light else _PAPER)
         image = Image.alpha_composite(paper, image)
     return image.convert("RGB")

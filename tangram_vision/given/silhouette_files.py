@@ -25,7 +25,7 @@ from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_vision.given.outline_files import Drawn, read_outline
 from tangram_vision.given.photos import Shade, find_silhouette
-from tangram_vision.given.picture_files import read_picture
+from tangram_vision.given.picture_files import SUFFIXES, read_picture
 from tangram_vision.silhouettes.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes.silhouettes import (
     UNLEARNED,
@@ -40,7 +40,6 @@ _DRAWN = 640  # pixels along the longer side of an outline that is drawn
 _BORDER = 0.1  # of it, around the outline
 _INK, _PAPER = (55, 60, 68), (250, 250, 247)
 _OFF = 0.05  # of the tokens' area, by which that of a drawing of known scale may be wrong
-PICTURES = (".png", ".jpg", ".jpeg", ".svg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +91,7 @@ def fill_silhouette(
         ConfigError: a file that cannot be used; whether it was filled is not checked.
     """
     path = Path(name)
-    if path.suffix.lower() not in PICTURES:
+    if path.suffix.lower() not in SUFFIXES:
         return _from_outline(read_outline(name, source), layout, scale, seconds, count, method)
     if count > 1:
         raise ConfigError(

@@ -371,7 +371,7 @@ def test_wrong_files_have_their_words(page: Page, tmp_path: Path) -> None:
     source(page, "file")
     wrong = {
         "notes.txt": (b"x", "a file of the kind '.txt' cannot be read"),
-        "broken.png": (b"\x89PNG\r\n", "no PNG or JPEG that can be read"),
+        "broken.png": (b"\x89PNG\r\n", "no PNG that can be read"),
         "large.png": (b"0" * 10_000_001, "large.png is larger than 10 MB"),
         "evil.svg": (b"<svg><script>alert(1)</script></svg>", "draws nothing"),
         "empty.json": (b"{}", "must be a mapping"),

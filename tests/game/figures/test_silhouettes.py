@@ -57,9 +57,17 @@ def read(name: str) -> object:
     return read_silhouette(name, load_run("pretrained/tangram7").task)
 
 
-@pytest.mark.parametrize("name", ["cat", "cat.png", "dark.jpg", "square.svg", "pieces.svg"])
+@pytest.mark.parametrize(
+    "name",
+    ["cat", "cat.png", "dark.jpg", "pale.webp", "cat.gif", "white.png", "square.svg", "pieces.svg"],
+)
 def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: str) -> None:
     picture(tmp_path / "cat.png")
+    picture(tmp_path / "cat.gif")
+    picture(tmp_path / "pale.webp", ground=255, ink=217)
+    with Image.open(tmp_path / "cat.png") as cat:
+        ink = cat.convert("L").point(lambda level: (235 - level) * 255 // 195)
+    Image.merge("LA", [Image.new("L", ink.size, 255), ink]).save(tmp_path / "white.png")
     picture(tmp_path / "dark.jpg", ground=30, ink=220)
     svg(tmp_path / "square.svg", SQUARE)
     svg(tmp_path / "pieces.svg", '<polygon points="0,0 8,0 8,8"/><polygon points="0,0 8,8 0,8"/>')
@@ -172,6 +180,24 @@ def test_a_file_is_named_from_where_the_command_was_started(
         ("cat", "cat"),
     ):
         assert with_absolute_paths({"silhouette": given})["silhouette"] == meant
+
+
+def test_a_figure_that_is_cut_off_is_refused(tmp_path: Path) -> None:
+    picture(tmp_path / "cat.png")
+    with Image.open(tmp_path / "cat.png") as cat:
+        both = Image.new("L", (600, 300), 235)
+        both.paste(cat, (220, 0))
+        ImageDraw.Draw(both).rectangle((0, 100, 60, 160), 40)
+    both.save(tmp_path / "both.png")
+    with pytest.raises(ConfigError, match="is cut off: a part of it reaches the picture's edge"):
+        read(str(tmp_path / "both.png"))
+
+
+@pytest.mark.parametrize("kind", ["heic", "pdf"])
+def test_a_kind_of_picture_that_is_not_read_is_named(tmp_path: Path, kind: str) -> None:
+    (tmp_path / f"it.{kind}").write_bytes(b"%PDF-1.7")
+    with pytest.raises(ConfigError, match=f"is no {kind.upper()} that can be read: save it anew"):
+        read(str(tmp_path / f"it.{kind}"))
 
 
 def test_a_picture_of_nothing_is_refused(tmp_path: Path) -> None:
