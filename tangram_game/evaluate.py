@@ -97,17 +97,13 @@ def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
 
 
 def _rivals(run: Run) -> dict[str, Player]:
-    task, result = run.setup.task, dict[str, Player]()
-    rivals, agent = dict(task.rivals()), run.setup.agent
+    others, agent = dict[str, Player](), run.setup.agent
     if isinstance(agent, Outline):
         if agent.config.beam > 1:
-            result["beam=1"] = by(run.with_settings({"agent": {"beam": 1}}).actor)
+            others["beam=1"] = by(run.with_settings({"agent": {"beam": 1}}).actor)
         # Of places that are worth the same the first is taken: that of the largest token.
-        return {**result, "largest first": by(run.unlearned().actor), **rivals}
-    first: dict[str, Player] = {
-        name: rivals.pop(name) for name in ("exact", "sweep rule") if name in rivals
-    }
-    return {**result, **first, **rivals}
+        others["largest first"] = by(run.unlearned().actor)
+    return others | dict(run.setup.task.rivals())
 
 
 def score_policies(

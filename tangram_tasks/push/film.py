@@ -18,7 +18,7 @@ from tangram_sim.drawing.strokes import MARGIN, TEXT
 from tangram_sim.world.arm import HOME, LIFTED, METRES, Motion, Panda
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_sim.world.stage import Stage
-from tangram_tasks.push.places import ARENA, AWAY, Push, on_table, push_of
+from tangram_tasks.push.places import ARENA, Push, corners_of, on_table, push_of
 
 if TYPE_CHECKING:
     from tangram_tasks.push.task import Push as Task
@@ -54,8 +54,7 @@ class Replayed:
         table.place(layout.poses(self.corners[number]), self.present, self.unknowns)
         found = [self.corners[number] for _ in path]
         for at in table.follow(path):
-            corners = layout.corners(table.poses())
-            corners[~self.present[layout.token_of_corner]] = AWAY
+            corners = corners_of(layout, table.poses(), self.present)
             found[at:] = [corners for _ in found[at:]]
         off = self.corners[number + 1] - found[-1]
         return [one + off * i / (len(path) - 1) for i, one in enumerate(found)]
