@@ -2,8 +2,8 @@
 
 What a push does to a token that lies alone is written down in the token's own frame, at the middle
 of what is unknown. A decision looks for the push, or the two pushes, after which least is left to
-go, among those that keep finger and token clear of the others. A planner then tries the best of
-them in an engine of its own, and others around the best of these (the cross-entropy method).
+go, among those that keep finger and token clear of the others. A planner tries the best of them in
+an engine of its own, and after the best of these others.
 
 Legend: N pushes of a shape, n of them, K tokens, V corners, C corners of a token.
 """
@@ -33,9 +33,8 @@ FIRST, SECOND = 120, 1000  # that are followed in thought, half the best, half a
 CLEAR = 0.02  # share of a token that may come to lie on another: it is pushed aside a little
 WAY_POINTS = 4  # of a token's way that are looked at
 BLOCKED = 1e3  # cost of a push that is not clear
-TRIED, ROUNDS = 24, 3  # a planner's pushes in an engine at first, and how often as many follow
-BEST = 6  # around which they are drawn
-AROUND = 0.25  # deviation of their numbers at first; each round halves it
+TRIED, KEPT, NEXT = 36, 8, 12  # pushes in an engine, the best of them, and after each of these
+LATER = 0.1  # of what is left now counts, beside what is left then: sooner is better
 WRONG = 2.0  # by which a planner is wrong about friction
 
 
@@ -91,21 +90,19 @@ def after(errors: Floats, moved: Floats) -> Floats:
 class Planner:
     """Chooses by what was tried of each shape alone, and by trials in an engine where there are."""
 
-    def __init__(
-        self, task: "Push", env: "PushEnv", tried: int = 1, rounds: int = 0, knows: str = "middle"
-    ) -> None:
+    def __init__(self, task: "Push", env: "PushEnv", tried: int = 0, knows: str = "middle") -> None:
         """Try pushes of each shape.
 
         Args:
             task: what is played.
             env: where.
-            tried: pushes that are tried in an engine before one is played; 1: none.
-            rounds: how often as many around the best are tried, too.
+            tried: pushes that are tried in an engine before one is played, and a few after them;
+                0: none.
             knows: of friction and centres of mass: middle, of what they are drawn from; all; wrong,
                 the finger's friction and the lever of the table's twice the middle.
         """
         self._middle, config = middle(task), task.config
-        self._env, self._count, self._rounds, self._knows = env, tried, rounds, knows
+        self._env, self._count, self._knows = env, tried, knows
         self._trials = Trials(task)
         self._task, self._layout = task, task.layout
         spread, friction = float(self._middle.spread[0]), self._middle.finger
@@ -132,8 +129,23 @@ class Planner:
     def _best(
         self, corners: Floats, goals: Floats, knows: Unknowns, rng: np.random.Generator
     ) -> Floats:
+        scene = np.asarray(corners, np.float64), np.asarray(goals, np.float64)
+        found = self._proposed(*scene, max(1, self._count), rng)
+        tried = self._outcomes(*scene, knows, found)[:KEPT] if self._count else []
+        if not tried:
+            return min(found, key=_cost)[1] if found else np.zeros(4)
+        costs = list[float]()
+        for left, _, there in tried:
+            more = self._proposed(there, scene[1], NEXT, rng)
+            then = [one[0] for one in self._outcomes(there, scene[1], knows, more)]
+            costs.append(min([left, *then]) + LATER * left)
+        return tried[int(np.argmin(costs))][1]
+
+    def _proposed(
+        self, corners: Floats, goals: Floats, count: int, rng: np.random.Generator
+    ) -> list[tuple[float, Floats]]:
+        """About so many pushes (4,), each after its cost: what is left if it is alone."""
         task, layout = self._task, self._layout
-        corners, goals = np.asarray(corners, np.float64), np.asarray(goals, np.float64)
         poses, desired = layout.poses(corners), layout.poses(goals)
         present = on_table(goals, layout)
         placed = task.placed(corners[None], goals[None])[0]
@@ -145,30 +157,24 @@ class Planner:
             clear = self._clear(token, chosen, poses, present)
             costs = np.where(clear, costs, costs + BLOCKED) - self._cost(token, error[None])[0]
             named = (token + 0.5) / layout.tokens * 2.0 - 1.0
-            for i in np.argsort(costs)[: max(1, self._count // len(left))].tolist():
+            for i in np.argsort(costs)[: max(1, count // len(left))].tolist():
                 action = np.append(named, self._tried[token].actions[chosen[i]])
                 found.append((float(costs[i]), action))
-        if not found:
-            return np.zeros(4)
-        if self._count > 1:
-            self._trials.begin(corners, goals, knows)
-            scene = desired, present
-            found = [(self._after(one, *scene), one) for _, one in found]
-            for number in range(self._rounds):
-                best = sorted(found, key=_cost)[:BEST]
-                chosen = rng.integers(len(best), size=self._count)
-                noise = rng.normal(size=(self._count, 3)) * AROUND / 2.0**number
-                others = [_moved(best[i][1], by) for i, by in zip(chosen, noise, strict=True)]
-                found += [(self._after(one, *scene), one) for one in others]
-        return min(found, key=_cost)[1]
+        return found
 
-    def _after(self, action: Floats, desired: Floats, present: Bools) -> float:
-        """What is left of all tokens after a push, tried in the engine: the least pushes first."""
-        corners = self._trials.after(action)
-        if corners is None:
-            return BLOCKED
-        now, whole = self._layout.poses(corners), 0.0
-        for token in np.flatnonzero(present).tolist():
+    def _outcomes(
+        self, corners: Floats, goals: Floats, knows: Unknowns, pushes: list[tuple[float, Floats]]
+    ) -> list[tuple[float, Floats, Floats]]:
+        """What is left after those that the engine allows, the least first, pushes and corners."""
+        self._trials.begin(corners, goals, knows)
+        found = [(one, self._trials.after(one)) for _, one in pushes]
+        left = [(self._left(at, goals), one, at) for one, at in found if at is not None]
+        return sorted(left, key=lambda one: one[0])
+
+    def _left(self, corners: Floats, goals: Floats) -> float:
+        """What is left of all tokens: the least pushes first."""
+        now, desired, whole = self._layout.poses(corners), self._layout.poses(goals), 0.0
+        for token in np.flatnonzero(on_table(goals, self._layout)).tolist():
             error = _error(now[token], desired[token])
             cost = float(self._cost(token, error[None])[0])
             if cost > 1.0:
@@ -230,9 +236,3 @@ class Planner:
 
 def _cost(found: tuple[float, Floats]) -> float:
     return found[0]
-
-
-def _moved(action: Floats, by: Floats) -> Floats:
-    """Another push (4,) of the same token; where its edge ends it begins."""
-    where, turn, far = action[1:] + by
-    return np.array([action[0], (where + 1.0) % 2.0 - 1.0, *np.clip((turn, far), -1.0, 1.0)])

@@ -201,10 +201,10 @@ class Push(Task):
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
         """Chance, what was tried of each shape alone, and planners with an engine of their own."""
-        from tangram_tasks.push.rivals import ROUNDS, TRIED, Planner  # noqa: PLC0415
+        from tangram_tasks.push.rivals import TRIED, Planner  # noqa: PLC0415
 
         def planner(env: Env, knows: str) -> Chooser:
-            return Planner(self, cast("PushEnv", env), TRIED, ROUNDS, knows)
+            return Planner(self, cast("PushEnv", env), TRIED, knows)
 
         return {
             "random": super().rivals()["random"],
