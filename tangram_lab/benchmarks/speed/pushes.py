@@ -8,13 +8,13 @@ from tangram_lab.benchmarks.measure import Row, Work, compare
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.world.engine import pybullet
 from tangram_sim.world.pushing import _STEP, PushTable
+from tangram_tasks.push.gym_env import SEVEN
 from tangram_tasks.push.places import Push as Pushed
 from tangram_tasks.push.places import begin, corners_of, push_of
 from tangram_tasks.push.task import Push, PushConfig
 from tangram_tasks.push.trials import middle
 
 COUNTS, PUSHES = (1, 2, 7), 64
-TANS = ("large_triangle",) * 2 + ("medium_triangle",) + ("small_triangle",) * 2 + ("square",)
 
 
 def measure_pushes(runs: int) -> list[Row]:
@@ -29,7 +29,7 @@ def measure_pushes(runs: int) -> list[Row]:
 
 def ways(count: int) -> tuple[PushTable, Work, Work]:
     """A table, and the same pushes on it by `PushTable` and step by step."""
-    task = Push(TokensConfig((*TANS, "parallelogram"), 0.6), PushConfig(count=count))
+    task = Push(TokensConfig(SEVEN, 0.6), PushConfig(count=count))
     table, layout, rng = PushTable(task.layout, 0.04), task.layout, np.random.default_rng(0)
     tokens, starts, _ = begin(layout, count, rng)
     poses, there = np.zeros((7, 3)), np.isin(np.arange(7), tokens)
