@@ -185,7 +185,7 @@ class PlayConfig(Settings):
     )
     silhouette: str | None = setting(
         None,
-        "instead of random targets: an outline that tells no pieces, a PNG, JPEG, SVG or JSON, or "
+        "instead of random targets: an outline that tells no pieces, a picture, SVG or JSON, or "
         "the name of a puzzle of the library; how the run's tokens fill it is searched first",
         only={"puzzle": None, "target": None},
     )

@@ -91,7 +91,7 @@ def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
     if tuple(rivals) != ALL:
         for name in rivals:
             if name not in others:
-                raise ConfigError(f"rivals: no '{name}' here, choose from all, {', '.join(others)}")
+                raise ConfigError(f"rivals: no '{name}' here, choose from {', '.join(others)}")
         others = {name: others[name] for name in rivals}
     return {RUN: by(run.actor)} | others
 

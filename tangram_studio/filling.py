@@ -31,12 +31,12 @@ from tangram_sim.targets.targets import placement, turned_figure
 from tangram_studio.messages import Fill
 from tangram_studio.playing import Sides, player
 from tangram_vision.given.outline_files import FORMAT, VERSION
-from tangram_vision.given.picture_files import SUFFIXES
+from tangram_vision.given.picture_files import READ
 from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
 from tangram_vision.silhouettes.approximations import nearest_figure
 from tangram_vision.silhouettes.silhouettes import Method, silhouette
 
-FILES = (*SUFFIXES, ".json")
+FILES = (*READ, ".json")
 SECONDS = 5.0  # of a search,
 FREE_SECONDS = 1.0  # where sides are not straight, so that hardly anything fits,
 NEAREST_SECONDS = 2.5  # and of what comes nearest
@@ -98,7 +98,7 @@ def fill(asked: Fill) -> Answer:
 
 
 def fill_file(name: str, data: bytes, who: str) -> Answer:
-    """Fill what a file shows: a PNG or JPEG, an SVG, outlines or a puzzle as JSON.
+    """Fill what a file shows: a picture, an SVG, outlines or a puzzle as JSON.
 
     Args:
         name: of the file; only its ending matters.

@@ -28,8 +28,8 @@ def read_puzzles(path: Path, rules: PuzzleRules | None = None) -> tuple[Puzzle, 
     """
     if path.suffix.lower() == ".svg":
         raise ConfigError(
-            f"puzzle={path} is a drawing, which tells no pieces: fill it by silhouette={path}, or "
-            "write the pieces into a JSON file"
+            f"puzzle={path} is a drawing, which tells no pieces: tangram-play silhouette={path} "
+            "fills it, or write the pieces into a JSON file"
         )
     text = read_text(path)
     return parse_puzzles(text, f"puzzle file {path.name}", rules)

@@ -278,7 +278,7 @@ class _Spots:
         largest = count[inside].max(initial=0)
         least = min(_DIRT * smallest * count[inside].sum(), largest / 2.0)
         kept = inside & (count > least)
-        cut = int(np.count_nonzero(~inside[1:] & (count[1:] > count[kept].min(initial=0))))
+        cut = int(np.count_nonzero(~inside[1:] & (count[1:] > least)))
         near = cv2.dilate(kept[label].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         alone = np.where(near, cover, 0.0).astype(np.float32)
         boxes = np.stack([left, top, left + wide, top + high], axis=1)[kept].astype(np.int64)

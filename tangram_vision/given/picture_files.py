@@ -13,10 +13,10 @@ from tangram_vision.given.svg_files import read_svg
 
 # Those of them that Pillow reads by itself; EPS, say, starts another program.
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "TIFF", "BMP", "AVIF", "PPM")
-SUFFIXES = (
+READ = (
     *(".png", ".jpg", ".jpeg", ".webp", ".gif", ".tif", ".tiff", ".bmp", ".avif", ".ppm", ".svg"),
-    *(".heic", ".heif", ".pdf"),  # refused, and told as what
 )
+SUFFIXES = (*READ, ".heic", ".heif", ".pdf")  # the last are refused, and told as what
 MAX_MEGAPIXELS = 64
 MIN_SIDE = 32
 LONGEST = 1280  # pixels of the longer side that are looked at

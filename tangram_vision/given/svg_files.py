@@ -1,84 +1,100 @@
 """A drawing as SVG, read without trust -> a picture of what it shows, by resvg.
 
-resvg is a fast program, not a wary one: what would keep it busy for minutes, or end it, is refused
-before. Text hangs on the fonts of a machine, so it is refused, too.
+resvg is a fast program, not a wary one: a small file can keep it busy for minutes, or end it. So it
+draws in a process of its own, with little time and memory.
 """
 
 import base64
 import re
+import subprocess
+import sys
 from io import BytesIO
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import resvg_py
 from PIL import Image
 
+from tangram_core.arrays import AnyArray
 from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.sketches import read_text
 
 SIDE = 2400  # pixels of a square that the whole drawing goes into
-MAX_TAGS, MAX_DEPTH = 2_000, 50
+SECONDS, BYTES = 10, 2 << 30  # that drawing may take
 _BORDER = SIDE // 8  # around it
-_REFUSED = {
-    "text": "convert it to paths",
-    "image": "give the picture itself",
-    "filter": "leave effects such as shadows out",
-}
-_STYLES = {"filter": _REFUSED["filter"], "transform": "write it as an attribute"}
+_SEEN = 24  # levels of any colour by which a figure differs from its ground
+_REFUSED = {"text": "convert it to paths", "image": "give the picture itself"}
+# As a picture in another one it stays within this size, and reads no other file.
 _FRAME = (
     '<svg xmlns="http://www.w3.org/2000/svg" width="{side}" height="{side}"><image width="{side}" '
     'height="{side}" href="data:image/svg+xml;base64,{content}"/></svg>'
 )
+_DRAW = """
+import resource, sys, resvg_py
+size, seconds = map(int, sys.argv[1:])
+resource.setrlimit(resource.RLIMIT_AS, (size, size))
+resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+drawn = resvg_py.svg_to_bytes(svg_string=sys.stdin.read(), dpi=96.0, shape_rendering="crisp_edges")
+sys.stdout.buffer.write(bytes(drawn))
+"""
 
 
 def read_svg(path: Path, source: str) -> Image.Image:
-    """What a file draws, with transparency, and around it a border of its ground.
+    """What a file draws, black on white, with a border around it.
 
     Raises:
         ConfigError: it cannot be used, and why.
     """
     text = read_text(path, source)
     _check(text, source)
-    # As a picture in another one it stays within this size, and reads no other file.
-    frame = _FRAME.format(side=SIDE, content=base64.b64encode(text.encode()).decode())
-    drawn = bytes(resvg_py.svg_to_bytes(svg_string=frame, shape_rendering="crisp_edges"))
-    pixels = np.asarray(Image.open(BytesIO(drawn)).convert("RGBA"))
+    pixels = _drawn(text, source)
     there = np.flatnonzero(pixels[..., 3].any(axis=0)), np.flatnonzero(pixels[..., 3].any(axis=1))
     if not len(there[0]):
         raise ConfigError(f"{source} draws nothing that has an area: draw an outline")
     (left, *_, right), (top, *_, low) = (one[[0, -1]] for one in there)
-    fills = SIDE in (right + 1 - left, low + 1 - top)
-    pixels = pixels[top : low + 1, left : right + 1]
-    rim = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])
-    # One colour all around the whole drawing, and another inside of it: that is its ground.
-    on_ground = fills and (rim == rim[0]).all() and (pixels != rim[0]).any()
-    ground = rim[0] if on_ground and (pixels[..., 3] > 0).all() else np.zeros(4, np.uint8)
-    whole = np.empty((len(pixels) + 2 * _BORDER, pixels.shape[1] + 2 * _BORDER, 4), np.uint8)
-    whole[:] = ground
-    whole[_BORDER:-_BORDER, _BORDER:-_BORDER] = pixels
-    return Image.fromarray(whole)
+    figure = _figure(pixels[top : low + 1, left : right + 1])
+    return Image.fromarray(np.where(np.pad(figure, _BORDER), 0, 255).astype(np.uint8))
+
+
+def _figure(pixels: AnyArray) -> AnyArray:
+    """(H, W) which pixels (H, W, 4) are not of the ground.
+
+    The ground is the one colour all around an opaque drawing, else white; if all is white on
+    nothing, that is the figure.
+    """
+    colour, there = pixels[..., :3].astype(np.int64), pixels[..., 3] > 127
+    rim = np.concatenate([colour[0], colour[-1], colour[:, 0], colour[:, -1]])
+    on_ground = there.all() and (rim == rim[0]).all()
+    for ground in ([rim[0]] if on_ground else []) + [np.full(3, 255)]:
+        found: AnyArray = there & (np.abs(colour - ground).max(axis=-1) >= _SEEN)
+        if found.any():
+            return found
+    return np.asarray(there)
+
+
+def _drawn(text: str, source: str) -> AnyArray:
+    """(SIDE, SIDE, 4) colours and how opaque they are."""
+    frame = _FRAME.format(side=SIDE, content=base64.b64encode(text.encode()).decode())
+    command = [sys.executable, "-I", "-c", _DRAW, str(BYTES), str(SECONDS)]
+    try:
+        done = subprocess.run(
+            command, input=frame.encode(), capture_output=True, timeout=2 * SECONDS, check=True
+        )
+    except subprocess.SubprocessError as error:
+        if b"ModuleNotFoundError" in (getattr(error, "stderr", None) or b""):
+            raise ConfigError(
+                f"{source} needs resvg, which is missing: pip install resvg-py"
+            ) from None
+        raise ConfigError(
+            f"{source} takes more than {SECONDS} s or {BYTES >> 30} GB to draw: simplify it"
+        ) from None
+    drawn: AnyArray = np.asarray(Image.open(BytesIO(done.stdout)).convert("RGBA"))
+    return drawn
 
 
 def _check(text: str, source: str) -> None:
-    """Refuse what would take long, and what would be drawn otherwise elsewhere."""
-    waiting = [(_parsed(text, source), 0)]
-    for name, remedy in _STYLES.items():
-        if re.search(rf"(?<![-\w]){name}\s*:\s*(?!none)", text):
-            raise ConfigError(f"{source} has a style with a {name}: {remedy}")
-    while waiting:
-        element, depth = waiting.pop()
-        if depth > MAX_DEPTH:
-            raise ConfigError(f"{source} nests deeper than {MAX_DEPTH} groups: ungroup it")
-        if (tag := _tag(element)) in _REFUSED:
-            raise ConfigError(f"{source} has an element <{tag}>: {_REFUSED[tag]}")
-        if tag != "foreignObject":  # no part of a drawing: labels in HTML
-            waiting += [(child, depth + 1) for child in element]
-
-
-def _parsed(text: str, source: str) -> ET.Element:
-    if text.count("<") > MAX_TAGS:
-        raise ConfigError(f"{source} has more than {MAX_TAGS} tags: draw its outline alone")
+    """Refuse what is no SVG, and what is drawn otherwise elsewhere, as text is by other fonts."""
     if re.search(r"<!\s*(doctype[^<>]*\[|entity)", text, re.IGNORECASE):
         raise ConfigError(f"{source} must have no ENTITY and no DOCTYPE with [...]: delete them")
     try:
@@ -86,10 +102,12 @@ def _parsed(text: str, source: str) -> ET.Element:
         root = ET.fromstring(text)  # noqa: S314
     except (ET.ParseError, ValueError) as error:
         raise ConfigError(f"{source} is not XML: {error}") from None
-    if _tag(root) != "svg":
-        raise ConfigError(f"{source} must be an <svg> element, got <{_tag(root)}>")
-    return root
-
-
-def _tag(element: ET.Element) -> str:
-    return str(element.tag).rpartition("}")[2]
+    tags = [str(element.tag).rpartition("}")[2] for element in root.iter()]
+    if tags[0] != "svg":
+        raise ConfigError(f"{source} must be an <svg> element, got <{tags[0]}>")
+    for tag in _REFUSED.keys() & {*tags}:
+        raise ConfigError(f"{source} has an element <{tag}>: {_REFUSED[tag]}")
+    styles = [one.get("style", "") for one in root.iter()]
+    styles += [one.text or "" for one in root.iter() if str(one.tag).endswith("style")]
+    if any(re.search(r"(?<![-\w])transform\s*:(?!\s*none)", style) for style in styles):
+        raise ConfigError(f"{source} has a style with a transform: write it as an attribute")

@@ -69,7 +69,7 @@ def test_only_the_rivals_that_are_asked_for_are_scored(tmp_path: Path) -> None:
     few = evaluated(tmp_path, SQUARE, episodes=2, rivals=("exact",))
     assert {*few["baselines"]} == {"exact"}
     assert evaluated(tmp_path, SQUARE, episodes=2, rivals=())["baselines"] == {}
-    with pytest.raises(ConfigError, match="no 'exakt' here, choose from all, exact, position only"):
+    with pytest.raises(ConfigError, match="no 'exakt' here, choose from exact, position only"):
         evaluated(tmp_path, SQUARE, episodes=2, rivals=("exakt",))
 
 

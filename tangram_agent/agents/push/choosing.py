@@ -49,6 +49,7 @@ def best(
     )
     never = never | ~scene.present.gather(1, slots).flatten()[:, None]
     values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
+    most = min(most, values.shape[1])
     values, at = values.topk(most, dim=1) if most > 1 else values.max(1, keepdim=True)
     slot, push = at // count, at % count
     row = torch.arange(size, device=drawn.device)[:, None] * each + slot
