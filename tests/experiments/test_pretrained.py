@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,9 @@ import yaml
 
 from tangram_agent.runs import load_run
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.run.service import ServiceConfig
+from tangram_core.setup import make_setup
+from tangram_core.store.checkpoints import save_checkpoint
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.puzzles import find_figures
@@ -125,6 +129,26 @@ def test_an_agent_of_outlines_ships_with_its_beam_and_is_told_as_such(
     assert set(card["tests"]["scores"]) == {"this run", "beam=1", "largest first", "random"}
     told = {*card["tests"]["scores"]["this run"], *card["puzzles"]["test"]["scores"]}
     assert {"iou", "share_solved_iou", "raw_overlap_p10"} <= told
+
+
+def test_an_agent_of_pushes_ships_trying_some_and_beside_who_is_quick(tmp_path: Path) -> None:
+    run = finished(tmp_path, 0, None, solved=0.5)
+    config = {
+        "task": {"kind": "push"},
+        "tokens": {"shapes": ["square"], "scale": 1.1},
+        "agent": {"kind": "push", "width": 8, "looked_at": 4},
+        "service": asdict(ServiceConfig()),
+    }
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    made = make_setup(config)
+    arrays = {"weights": made.agent.learner(made.task, 0, "cpu").export(), "learner": {}}
+    arrays["learner"]["updates"] = np.array([7])
+    save_checkpoint(run / "checkpoints", 7, arrays, {}, keep=1)
+    folder = publish([run], "pushes", tmp_path / "out", 1)
+    card = json.loads((folder / "card.json").read_text())
+    assert load_run(folder).setup.agent.config.tried == 16
+    assert set(card["tests"]["scores"]) == {"this run", "random", "table"}
+    assert "median of the seeds by final solved" in card["selection"]
 
 
 def test_an_agent_is_evaluated_like_a_run(tmp_path: Path) -> None:

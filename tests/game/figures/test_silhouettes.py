@@ -187,7 +187,10 @@ def test_a_figure_that_is_cut_off_is_refused(tmp_path: Path) -> None:
     with Image.open(tmp_path / "cat.png") as cat:
         both = Image.new("L", (600, 300), 235)
         both.paste(cat, (220, 0))
-        ImageDraw.Draw(both).rectangle((0, 100, 60, 160), 40)
+    ImageDraw.Draw(both).rectangle((0, 100, 3, 103), 40)
+    both.save(tmp_path / "speck.png")
+    read(str(tmp_path / "speck.png"))
+    ImageDraw.Draw(both).rectangle((0, 100, 60, 160), 40)
     both.save(tmp_path / "both.png")
     with pytest.raises(ConfigError, match="is cut off: a part of it reaches the picture's edge"):
         read(str(tmp_path / "both.png"))

@@ -17,7 +17,7 @@ from tangram_core.agent import Learner
 from tangram_core.conformance import check_agent, play
 from tangram_core.errors import ConfigError
 from tangram_core.seeding import episode_generator
-from tangram_core.task import Generators, Played
+from tangram_core.task import Generators, History, Played
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_tasks.push.places import push_of
 from tangram_tasks.push.task import Push, PushConfig
@@ -166,6 +166,14 @@ def test_a_push_that_is_tried_in_the_engine_is_known_to_lead_home() -> None:
             goals[table] = after
     assert not TWO.placed(corners, goals).all(axis=1).any()
     assert actor._tried(corners, goals, actions).tolist() == place
+
+
+def test_no_more_pushes_are_tried_than_there_are() -> None:
+    actor = Pushing(replace(SMALL, tried=1000)).actor(SQUARE)
+    with closing(SQUARE.make(1)) as env:
+        assert actor.act(
+            env.reset(generators("test", 0, 1)), History({}, np.zeros((1, 0, 4)))
+        ).shape == (1, 4)
 
 
 def test_hindsight_takes_whole_tokens_of_what_was_reached() -> None:
