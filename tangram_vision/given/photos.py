@@ -116,7 +116,7 @@ def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
     """
     cover = _coverage(np.asarray(picture.convert("L")))
     spots = _spots(cover, layout, source)
-    if spots.cut:
+    if spots.lacks:
         raise ConfigError(
             f"{source} is cut off: a part of it reaches the picture's edge, leave ground around it"
         )
@@ -261,11 +261,13 @@ class _Spots:
         cover: (H, W) coverage by them alone.
         boxes: (N, 4) left, top, right and bottom of each.
         cut: areas that reach the photograph's edge, and were left out.
+        lacks: whether one of these is as large as what counts.
     """
 
     cover: Singles
     boxes: Ints
     cut: int
+    lacks: bool
 
     @staticmethod
     def of(cover: Singles, smallest: float) -> "_Spots":
@@ -278,11 +280,12 @@ class _Spots:
         largest = count[inside].max(initial=0)
         least = min(_DIRT * smallest * count[inside].sum(), largest / 2.0)
         kept = inside & (count > least)
-        cut = int(np.count_nonzero(~inside[1:] & (count[1:] > least)))
+        at_edge = ~inside[1:] & (count[1:] > count[kept].min(initial=0))
+        cut, lacks = int(np.count_nonzero(at_edge)), bool((count[1:][at_edge] > least).any())
         near = cv2.dilate(kept[label].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         alone = np.where(near, cover, 0.0).astype(np.float32)
         boxes = np.stack([left, top, left + wide, top + high], axis=1)[kept].astype(np.int64)
-        return _Spots(alone, boxes, cut)
+        return _Spots(alone, boxes, cut, lacks)
 
     def cut_out(self) -> tuple[Singles, tuple[int, int]]:
         """The square around all areas, and the column and row of its upper left corner."""

@@ -151,9 +151,8 @@ def test_a_figure_is_seen_laid_and_saved(page: Page, tmp_path: Path) -> None:
         path = tmp_path / f"cat.{kind}"
         saved.value.save_as(path)
         assert path.read_bytes().startswith(begins)
-    for kind in ("svg", "json"):
-        (puzzle,) = read_puzzles(tmp_path / f"cat.{kind}", PuzzleRules(0.6))
-        assert puzzle.name == "cat"
+    (puzzle,) = read_puzzles(tmp_path / "cat.json", PuzzleRules(0.6))
+    assert puzzle.name == "cat"
     with Image.open(tmp_path / "cat.gif") as film:
         assert getattr(film, "n_frames", 1) > 60
 
