@@ -61,8 +61,8 @@ def tried_alone(
     """Random pushes of a shape; some seconds when they are asked for first."""
     layout, rng = Layout([shape]), np.random.default_rng(0)
     table, present = PushTable(layout, finger), np.ones(1, np.bool_)
-    middle = Unknowns(np.ones(1), np.full(1, spread), friction, np.zeros((1, 2)))
-    table.place(np.zeros((1, 3)), present, middle)
+    unknowns = Unknowns(np.ones(1), np.full(1, spread), friction, np.zeros((1, 2)))
+    table.place(np.zeros((1, 3)), present, unknowns)
     actions, moved = rng.uniform(-1.0, 1.0, (PUSHES, 3)), np.zeros((PUSHES, 3))
     begins, ends = np.zeros((2, PUSHES, 2))
     corners = layout.corners(np.zeros((1, 3)))

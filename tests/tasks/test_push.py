@@ -21,6 +21,7 @@ from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
 from tangram_tasks.push.places import AWAY, on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
+from tangram_tasks.push.trials import middle
 
 pytestmark = pytest.mark.fast
 
@@ -185,6 +186,18 @@ def test_who_learned_nothing_pushes_a_square_into_place(name: str, few_tried: No
     assert scores["solved"] >= 0.5
     assert scores["pushes"] < 8
     assert scores["coverage"] > 0.7
+
+
+def test_planners_know_the_middle_all_or_what_is_wrong(few_tried: None) -> None:
+    with closing(SQUARE.make(2)) as env:
+        env.reset(generators(2))
+        own = middle(SQUARE)
+        for name, finger in (
+            ("planner", own.finger),
+            ("planner_told", env.unknowns[1].finger),  # type: ignore[attr-defined]
+            ("planner_wrong", 2.0 * own.finger),
+        ):
+            assert SQUARE.rivals()[name](env)._known(1).finger == finger  # type: ignore[attr-defined]
 
 
 def test_one_of_two_tokens_is_half_of_the_reward() -> None:
