@@ -31,7 +31,7 @@ class Critic(nn.Module):
         self.value = nn.Sequential(*_ended(width), perceptron(width, (width,), 1, norm=True))
 
     def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
-        """(n, N) of pushes (n, N, 18)."""
+        """(n, N) of pushes (n, N, 22)."""
         others = (self.other(seen.others) * seen.there[..., None]).sum(1)
         scene = self.scene(self.mixed(self.token(seen.token) + self.others(others)))
         value: Tensor = self.value(scene[:, None] + self.push(pushes))
@@ -53,7 +53,7 @@ class Twins(nn.Module):
             self._form = [Critic(corners, width)]  # a list: no part of this module
 
     def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
-        """(2, n, N) of pushes (n, N, 18)."""
+        """(2, n, N) of pushes (n, N, 22)."""
         values: Tensor = vmap(lambda *own: self._value(own, seen, pushes))(*self.weights)
         return values
 

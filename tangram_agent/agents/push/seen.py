@@ -19,7 +19,7 @@ from tangram_agent.agents.push.scenes import (
 from tangram_tasks.push.places import ARENA
 
 LEFT = 9  # numbers of a way that is left
-PUSH = 5 + LEFT + 4  # of a push: what moves, the table's edge, what is left, the others
+PUSH = 5 + LEFT + 8  # of a push: what moves, the table's edge, what is left, the others
 _LARGE = 3.0  # by which a token's corners come to about 1
 _NEAR = 0.1  # gaps above it are all alike
 _EDGE = 0.3  # so are distances from the table's edge
@@ -43,6 +43,7 @@ class Seen:
         token: (n, F) itself.
         others: (n, K - 1, G).
         there: (n, K - 1) 1 where there is one.
+        placed: (n, K - 1) whether it is in its place.
         pose, left: (n, 3) its pose, and its way to its place, in its own frame.
         which: (n,) token of the set.
         outlines: (2, C, n, K - 1) of the others, on the table.
@@ -51,6 +52,7 @@ class Seen:
     token: Tensor
     others: Tensor
     there: Tensor
+    placed: Tensor
     pose: Tensor
     left: Tensor
     which: Tensor
@@ -78,8 +80,9 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor) -> Seen:
         turn = angles - pose[:, None, 2]
         return torch.stack([torch.cos(turn), torch.sin(turn)], dim=-1)
 
+    left_of_others = left[at]
     others = [
-        ways(tokens, left[at]),
+        ways(tokens, left_of_others),
         tokens.outlines[kinds].flatten(2) * _LARGE,
         here(poses.movedim(-1, 0)),
         heading(poses[..., 2]),
@@ -88,7 +91,7 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor) -> Seen:
         heading(goals[..., 2]),
     ]
     there = scene.present[at].to(pose.dtype)
-    seen = torch.cat(token, dim=-1), torch.cat(others, dim=-1), there
+    seen = torch.cat(token, dim=-1), torch.cat(others, dim=-1), there, tokens.near(left_of_others)
     return Seen(*seen, pose, own, which, outlines)
 
 
@@ -111,7 +114,7 @@ def edge(points: Tensor) -> Tensor:
 def pushes(
     tokens: Tokens, seen: Seen, begins: Tensor, ends: Tensor, moved: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What is seen of pushes (n, N, 18), and which cannot be made (n, N).
+    """What is seen of pushes (n, N, 22), and which cannot be made (n, N).
 
     Args:
         tokens: the set.
@@ -128,7 +131,7 @@ def pushes(
     parts = [moved * 3.0, edge(first), edge(last), ways(tokens, left)]
     others = seen.outlines[:, :, :, None]
     if not others.shape[-1]:
-        parts.append(torch.ones_like(moved[..., :1]).expand(*moved.shape[:2], 4))
+        parts.append(torch.ones_like(moved[..., :1]).expand(*moved.shape[:2], 8))
         return torch.cat(parts, dim=-1), beyond
     which = seen.which[:, None].expand(moved.shape[:2])
     first, last = (at.movedim(-1, 0)[..., None] for at in (first, last))
@@ -138,7 +141,9 @@ def pushes(
         gap(tokens.laid(placed_at(pose, moved), which)[..., None], others),
         gap(tokens.laid(placed_at(pose, moved / 2.0), which)[..., None], others),
     ]
-    least = torch.stack([one.amin(-1) for one in near], dim=-1)
-    parts.append(least.clamp(-_NEAR, _NEAR) / _NEAR)
+    room = torch.stack(near)
+    for some in (seen.placed, ~seen.placed):  # to hit a token in its place is worse
+        least = torch.where(some[:, None], room, _NEAR).amin(-1).movedim(0, -1)
+        parts.append(least.clamp(-_NEAR, _NEAR) / _NEAR)
     blocked = distance(others, first).amin(-1) < tokens.finger
     return torch.cat(parts, dim=-1), beyond | blocked

@@ -109,7 +109,7 @@ def test_a_token_that_is_not_there_is_not_seen() -> None:
     gone = replace(found, present=torch.tensor([[True, True, False]]).expand(4, 3))
     poses = gone.poses.clone()
     poses[:, 2] += 5.0
-    slots, zeros = torch.zeros(4, dtype=torch.int64), torch.zeros(4, 1, 18)
+    slots, zeros = torch.zeros(4, dtype=torch.int64), torch.zeros(4, 1, 22)
     values = [
         critic(seen_by(tokens, one, slots), zeros) for one in (gone, replace(gone, poses=poses))
     ]
