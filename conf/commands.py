@@ -244,7 +244,7 @@ how much of the target is covered and how many are solved (95 % covered), and pl
 those that come with tangram-rl or your own, see docs/puzzles.md.""",
         (
             "tangram-eval run_dir=runs/my_run episodes=1000 out=scores.json",
-            "tangram-eval run_dir=runs/my_run sim.actions_per_token=3 sim.corner_noise=0.01",
+            "tangram-eval run_dir=runs/my_run sim.actions_per_token=3 sim.backend=kinematic",
             "tangram-eval run_dir=runs/my_game puzzle=test turns=8 out=puzzles.json "
             "sheet=puzzles.png",
         ),

@@ -71,7 +71,7 @@ def _laid_over(command: Command) -> Iterator[str]:
     if command.over:
         names = ", ".join(f"`{name}`" for group in command.over for name in playable(group))
         yield (
-            "In place of what the run was trained with, as in `sim.corner_noise=0.01`: "
+            "In place of what the run was trained with, as in `sim.actions_per_token=3`: "
             f"{names}. The others of {', '.join(command.over)} are refused."
         )
 

@@ -60,8 +60,7 @@ def evaluate_run(config: EvalConfig) -> int:
     Policies that learned nothing play the same episodes, to compare with: `exact` moves every
     token exactly onto its target, `position only` one token onto its centre and never turns it,
     `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order that pushes the
-    least out of place. Where several noisy looks at tokens can be put together, `oracle` is `exact`
-    by all of them.
+    least out of place.
 
     Returns:
         Exit status 0.
@@ -204,9 +203,8 @@ def _observed(sim: SimConfig) -> str:
         pieces = "" if sim.observe == "pictures" else ", pieces hidden"
         return f"{sim.picture} pictures of {sim.pixels} px{pieces}"
     if sim.observe == "silhouette":
-        noise = f", corners with noise {sim.corner_noise:g}" if sim.corner_noise else ""
-        return f"exact outlines, pieces hidden{noise}"
-    return f"corners with noise {sim.corner_noise:g}" if sim.corner_noise else "exact corners"
+        return "exact outlines, pieces hidden"
+    return "exact corners"
 
 
 def write_sheet(path: str, task: Place, scored: Scored) -> None:

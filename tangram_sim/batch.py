@@ -27,7 +27,6 @@ from tangram_sim.motion.actions import (
 )
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
 from tangram_sim.sight.lens import Lens, View
-from tangram_sim.sight.observation_noise import see
 from tangram_sim.sight.perception import Eye, Sight
 from tangram_sim.targets.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world.world import check_shown, make_world
@@ -96,10 +95,9 @@ class BatchedEnv:
         corners: (B, V, 2) of the tokens.
         placed: (B, K) which tokens are placed.
         goals: (B, V, 2) corners of the targets.
-        seen: `corners` as an agent sees them, new noise at every step if there is any, or as they
-            are found in pictures.
-        seen_goals: (B, G, 2) `goals` as an agent sees them, with one noise for the whole episode,
-            or exact rows of their outlines, see `rings`.
+        seen: `corners` as an agent sees them: as they are, or as they are found in pictures.
+        seen_goals: (B, G, 2) `goals` as an agent sees them: so, or rows of their outlines, see
+            `rings`.
         sight: what is found in pictures, where these are the agent's only source, else None.
         pictures: (B, P, P) of the tokens, as the camera had them last.
     """
@@ -206,7 +204,7 @@ class BatchedEnv:
         if self.sim.observe == "silhouette":
             self.seen_goals = self._outlined()
         elif self.sight is None:
-            self.seen_goals = see(self.goals, self.sim, generators)
+            self.seen_goals = self.goals
         else:
             self.seen_goals = self.sight.goals
         self._look()
@@ -341,6 +339,6 @@ class BatchedEnv:
         self._flipped = np.stack([world.flipped() for world in self._worlds])
         self.corners = self.layout.corners(self._poses, self._flipped)
         if self.sight is None:
-            self.seen = see(self.corners, self.sim, self._generators)
+            self.seen = self.corners
         else:
             self.seen = self.sight.corners

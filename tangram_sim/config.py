@@ -7,7 +7,7 @@ from typing import Any
 
 from tangram_core.errors import ConfigError
 from tangram_core.run.code import own_code
-from tangram_core.settings import NETWORK, Settings, refuse_ignored, setting, told
+from tangram_core.settings import NETWORK, Settings, refuse_ignored, setting
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense")
@@ -21,8 +21,6 @@ LOOKED_AT = ("pictures", "silhouette_pictures")
 # The settings of the camera.
 CAMERA = ("pixels", "picture", "disturbance")
 NO_PICTURES: dict[str, object] = {"pixels": 0}
-# A fifth of the arena is a whole token: nothing is left to see beyond.
-MAX_CORNER_NOISE = 0.2
 MOTIONS = ("lift", "slide")
 # Share of a token that may come to lie on others where it is set down: the engine pushes such
 # tokens apart by a little, and with more it would move what is placed.
@@ -42,13 +40,6 @@ class SimConfig(Settings, section="sim"):
         2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens", part=NETWORK
     )
     actions_per_token: int = setting(1, "actions that each token has", low=1, high=100)
-    corner_noise: float = setting(
-        0.0,
-        "deviation of the Gaussian noise on the corners that agents see; scores are exact",
-        low=0,
-        high=MAX_CORNER_NOISE,
-        unit="arenas",
-    )
     observe: str = setting(
         "corners",
         "what agents see: corners as they are, or what is found in the camera's pictures; then "
@@ -144,11 +135,6 @@ class SimConfig(Settings, section="sim"):
             raise ConfigError(
                 f"sim.observe={self.observe} needs pictures, got sim.pixels=0: set sim.pixels=128"
             )
-        if self.corner_noise:
-            given = f"sim.corner_noise={told(self.corner_noise)}"
-            remedy = "set sim.disturbance"
-            because = f"sim.observe={self.observe}"
-            refuse_ignored(given, because, remedy, SimConfig.corner_noise)
 
 
 def with_given_reward(read: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -32,10 +32,10 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     Observations are a dict of float64 vectors: `achieved_goal` and `desired_goal` are the corners
     of the tokens and of the targets, (2V,); `observation` is the tokens' corners and one flag per
-    token that is placed, (2V + K,), with the noise of `sim.corner_noise`. An episode has
-    K * actions_per_token steps. It is terminated by the last of them if all tokens are placed, and
-    truncated if some are left, as refused actions used up their steps, and where a lone token has
-    several actions: that is a time limit, after which it could go on.
+    token that is placed, (2V + K,). An episode has K * actions_per_token steps. It is terminated by
+    the last of them if all tokens are placed, and truncated if some are left, as refused actions
+    used up their steps, and where a lone token has several actions: that is a time limit, after
+    which it could go on.
 
     Actions are those of `BatchedEnv`, entries in [-1, 1]: which token (with several), flip (with
     `allow_flip`: above 0 turns a token over that is not its own mirror image), then x, y and

@@ -29,8 +29,7 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
     """The configured reward as a function (achieved, desired) -> (B,).
 
     With source=camera it is Eq. 14 on polygons too: a goal that was relabelled has no picture.
-    `BatchedEnv` replaces it by the camera's value while playing. With sim.corner_noise the rigid
-    pieces that fit the corners best are rewarded.
+    `BatchedEnv` replaces it by the camera's value while playing.
 
     Raises:
         ConfigError: the camera is to be the source but is off, or a user's function that cannot
@@ -40,9 +39,6 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
         raise ConfigError("reward.source=camera needs pictures: set sim.pixels=64")
     # The longest distance of two points of the arena.
     reach = sim.arena * np.sqrt(2.0)
-    if sim.corner_noise > 0.0:
-        exact = make_reward(config, layout, replace(sim, corner_noise=0.0))
-        return lambda achieved, desired: exact(_fitted(achieved, layout), _fitted(desired, layout))
     if config.own is not None:
         function = _load(config, *config.own)
         return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
@@ -61,11 +57,6 @@ def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
     apart[1, :, 0] = sim.arena / 4.0
     corners = layout.corners(apart)
     make_reward(config, layout, sim)(corners, corners[::-1])
-
-
-def _fitted(corners: Floats, layout: Layout) -> Floats:
-    """The rigid pieces nearest to noisy corners (B, V, 2), which need not be convex."""
-    return layout.corners(layout.poses(corners), layout.flipped(corners))
 
 
 def overlap(achieved: Floats, desired: Floats, layout: Layout) -> Floats:

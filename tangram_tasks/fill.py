@@ -78,7 +78,6 @@ class Fill(Place):
             "starts": "outside",
             "actions_per_token": 1,
             "allow_flip": self.layout.any_chiral or sim.allow_flip,
-            "corner_noise": 0.0,
         }
         for name, value in wanted.items():
             given = getattr(sim, name)

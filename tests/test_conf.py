@@ -260,11 +260,11 @@ def test_help_of_what_is_laid_over_a_run_has_what_it_may_be_played_with(group: s
 
 
 def test_settings_are_laid_over_a_run_one_by_one() -> None:
-    made = compose("eval", "run_dir=x", "sim.corner_noise=0.01", "agent.reapply=1")
+    made = compose("eval", "run_dir=x", "sim.actions_per_token=3", "agent.reapply=1")
     given = {f"{s}.{n}": v for s in OVER for n, v in made[s].items() if v is not None}
-    assert given == {"sim.corner_noise": 0.01, "agent.reapply": 1}
-    with pytest.raises(ConfigError, match="did you mean 'sim.corner_noise'"):
-        compose("eval", "run_dir=x", "sim.corner_nois=0.01")
+    assert given == {"sim.actions_per_token": 3, "agent.reapply": 1}
+    with pytest.raises(ConfigError, match="did you mean 'sim.actions_per_token'"):
+        compose("eval", "run_dir=x", "sim.actions_per_tokens=3")
 
 
 def test_known_settings_are_those_that_compose() -> None:

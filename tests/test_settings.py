@@ -116,7 +116,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.backend": (SEVERAL, "physics"),
     "sim.arena": (ONE, 2.5),
     "sim.actions_per_token": (ONE, 2),
-    "sim.corner_noise": (ONE, 0.01),
     "sim.motion": (over(SEVERAL, sim={"backend": "physics"}), "slide"),
     "sim.targets": (SEVERAL, "connected"),
     "sim.starts": (SEVERAL, "outside"),
@@ -327,14 +326,7 @@ def test_every_setting_of_a_command_is_read() -> None:
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
         (ONE, "sim.picture", "grey", "sim.pixels=0"),
         (ONE, "sim.disturbance", 1.0, "sim.pixels=0"),
-        (over(SEEN, sim={"observe": "pictures"}), "sim.corner_noise", 0.01, "sim.observe=pictures"),
         (over(ONE, sim={"observe": "silhouette"}), "sim.pixels", 64, "sim.observe=silhouette"),
-        (
-            over(SEEN, sim={"observe": "silhouette_pictures"}),
-            "sim.corner_noise",
-            0.01,
-            "sim.observe=silhouette_pictures",
-        ),
     ],
 )
 def test_a_setting_without_effect_is_refused(

@@ -9,7 +9,6 @@ from tangram_core.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.kinematics import wrap
-from tangram_sim.sight.observation_noise import noise_bound
 
 _ROUNDING = 1.0 + 1e-6
 
@@ -35,14 +34,14 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
     A start lies inside the arena, and each action moves a token in x and in y by at most the
     arena's width; turning keeps a corner within the start's margin for every angle. A token that
     slides may push another as far, in each action of the episode; one that settles moves others by
-    less, wherever it was set down. What an agent sees may lie further out by the noise's bound.
+    less, wherever it was set down.
     Pictures show a token with its middle in them, wherever the camera stands, and while they show
     nothing of it, it is taken to lie where it was told to go.
     """
     pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
     inside = 1.0 if sim.looks else 0.5
     moved = sim.actions_per_token + pushes
-    return (sim.arena * (inside + moved) + noise_bound(sim)) * _ROUNDING
+    return sim.arena * (inside + moved) * _ROUNDING
 
 
 def goal_rows(layout: Layout, sim: SimConfig) -> int:

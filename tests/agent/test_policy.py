@@ -249,10 +249,9 @@ def learns(made: Setup) -> None:
 
 
 @pytest.mark.parametrize("kind", ["pair", "scene"])
-@pytest.mark.parametrize("noise", [0.0, 0.05])
-def test_whole_episodes_of_a_token_with_two_sides(kind: str, noise: float) -> None:
+def test_whole_episodes_of_a_token_with_two_sides(kind: str) -> None:
     """Either plays every task, also one whose tokens may be turned over."""
-    made = setup(TWO, {"kind": kind}, PERCEPTRON, allow_flip=True, corner_noise=noise)
+    made = setup(TWO, {"kind": kind}, PERCEPTRON, allow_flip=True)
     policy = policy_of(made)
     with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, 4)) as env:
         env.reset(generators(4))
@@ -364,7 +363,7 @@ def test_settings_that_a_trained_run_cannot_play_with_are_refused(
 
 def test_settings_of_the_world_are_those_that_are_played_in() -> None:
     run = run_of(seven({}, PERCEPTRON))
-    other = run.with_settings({"sim": {"allow_flip": True, "corner_noise": 0.01}})
-    assert (other.task.sim.allow_flip, other.task.sim.corner_noise) == (True, 0.01)
+    other = run.with_settings({"sim": {"allow_flip": True, "targets": "connected"}})
+    assert (other.task.sim.allow_flip, other.task.sim.targets) == (True, "connected")
     assert other.act(seen_in(transitions(other.setup, 8))).shape == (8, 5)
     assert run.with_settings({"sim": {}}) is run

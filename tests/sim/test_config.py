@@ -65,7 +65,6 @@ REFUSED = [
     (SimConfig, {"backend": "x"}, "sim.backend must be one of physics, kinematic, got 'x'"),
     (SimConfig, {"arena": 0.0}, "sim.arena must be between 0.001 and 1000"),
     (SimConfig, {"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
-    (SimConfig, {"corner_noise": 0.3}, "sim.corner_noise must be between 0 and 0.2, got 0.3"),
     (SimConfig, {"pixels": 15}, "sim.pixels must be 0 or at least 16, got 15"),
     (SimConfig, {"observe": "pictures"}, "^sim.observe=pictures needs .*: set sim.pixels=128$"),
     (

@@ -50,7 +50,7 @@ def covering(corners: Corners, goals: Corners, layout: Layout) -> Floats:
     """(B, K, K) area of piece j that token i covers where it lies, placed or not.
 
     Args:
-        corners: (B, V, 2) of the tokens; with noise, of the pieces that fit them best.
+        corners: (B, V, 2) of the tokens; from pictures, of the pieces that fit them best.
         goals: (B, V, 2) of the targets.
         layout: of both.
     """

@@ -4,7 +4,6 @@ And chance, which plays by the rules.
 """
 
 from contextlib import closing
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from tangram_core.task import Chooser, History
 from tangram_sim.motion.kinematics import wrap
 from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
-from tangram_tasks.rivals.oracle import oracle_policy
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
 from worker.score.test_set import FixedTests
@@ -41,21 +39,6 @@ def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -
     assert scores["raw_overlap_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
-
-
-@pytest.mark.parametrize("sim", [{}, {"backend": "physics"}])
-@pytest.mark.parametrize("tokens", [SQUARE, PAIR], ids=["one", "two"])
-def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any]) -> None:
-    """The look at the target is one: its noise is left, and of eight looks at a token a third."""
-    made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim).task
-    found = []
-    with closing(FixedTests(made, 30, 15)) as tests:
-        for policy in (oracle_policy, exact_policy):
-            played = Played.of(tests.play(policy(made.layout, made.sim)))
-            # From where the target is seen: what no policy can know is no matter here.
-            ends, goals = (made.layout.poses(c) for c in (played.ends, played.episodes["goals"]))
-            found.append(np.median(np.abs(ends - goals)[..., :2]))
-    assert found[0] < 0.7 * found[1]
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -15,7 +15,6 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.geometry.shapes import SHAPE_NAMES, Shape, mirror_image, polygon, tan, turn_onto
 from tangram_sim.motion.actions import action_size, flips
-from tangram_sim.rewards import make_reward
 from tangram_sim.sight.pictures import TOKEN_GRAY, rasterise
 from tangram_sim.world.world import World, make_world
 from tests.sim.builders import LOPSIDED, SEVEN, layout_of, random_poses
@@ -109,16 +108,12 @@ def test_overlap_is_the_same_in_the_mirror(seed: int) -> None:
     assert (overlap_share(own, own, LAYOUT) > 0.5).all()
 
 
-def test_sides_are_told_of_noisy_corners_and_rewarded_as_rigid_pieces() -> None:
+def test_sides_are_told_of_noisy_corners() -> None:
     layout = layout_of("parallelogram", scale=1.0)
     sides = np.random.default_rng(1).random((200, 1)) < 0.5
     corners = layout.corners(random_poses(np.random.default_rng(0), 200, 1, 0.5), sides)
     noisy = corners + np.random.default_rng(2).normal(0.0, 0.04, corners.shape)
     np.testing.assert_array_equal(layout.flipped(noisy), sides)
-    reward = make_reward(RewardConfig(), layout, SimConfig(corner_noise=0.02))
-    shifted = corners + 0.1
-    expected = 2.0 * overlap_share(shifted, corners, layout) - 1.0
-    np.testing.assert_allclose(reward(shifted, corners), expected, atol=1e-9)
 
 
 @pytest.fixture(params=["physics", "kinematic"])

@@ -79,7 +79,6 @@ def test_no_world_leaves_the_bound(seed: int, monkeypatch: pytest.MonkeyPatch) -
         motion="slide" if engine and seed % 2 else "lift",
         arena=float(rng.choice([1.5, 2.0, 100.0])),
         actions_per_token=int(rng.integers(2, 4)),
-        corner_noise=float(rng.choice([0.0, 0.2])),
     )
     layout = layout_of("square", "large_triangle", scale=0.2 * sim.arena)
     check_targets(layout, sim)

@@ -149,8 +149,8 @@ def test_play_ends_before_an_action_when_it_is_told_to(asked: int, groups: int) 
     assert episodes.count == rollout.episode == 3 * groups
 
 
-def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
-    made = setup(corner_noise=0.02)
+def test_what_the_policy_sees_in_pictures_is_what_travels() -> None:
+    made = setup(observe="pictures", pixels=32, backend="physics")
     seen: list[np.ndarray] = []
 
     def choose(now: Arrays, *_: object) -> Any:
@@ -163,5 +163,7 @@ def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
     episodes = played.episodes
     np.testing.assert_array_equal(episodes["corners"][:, 0], seen[0].astype(np.float32))
     np.testing.assert_array_equal(episodes["goals"], seen[1].astype(np.float32))
-    for noisy, exact in ((episodes["corners"], played.corners), (episodes["goals"], played.goals)):
-        assert 0.02 < np.abs(noisy - exact).max() <= 4 * 0.02 * made.task.sim.arena + 1e-6
+    for found, exact in ((episodes["corners"], played.corners), (episodes["goals"], played.goals)):
+        assert np.abs(found - exact).max() > 0.0
+        middles = (one.mean(axis=-2) for one in (found, exact))  # alike corners have no names
+        np.testing.assert_allclose(*middles, atol=0.05)

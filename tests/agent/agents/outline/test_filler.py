@@ -150,7 +150,6 @@ def test_filled_is_surer_than_any_value() -> None:
         ({"copies": 0}, {}, "agent.copies must be between 1 and 64, got 0"),
         ({}, {"starts": "anywhere"}, r"sim.starts=anywhere: .* set sim.starts=outside"),
         ({}, {"actions_per_token": 2}, r"actions_per_token=2: .* set sim.actions_per_token=1"),
-        ({}, {"corner_noise": 0.01}, "sim.corner_noise"),
     ],
 )
 def test_what_an_agent_of_outlines_cannot_use_is_refused(
