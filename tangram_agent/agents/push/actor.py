@@ -13,11 +13,11 @@ from tangram_agent.agents.push.agent import PushingConfig
 from tangram_agent.agents.push.choosing import best
 from tangram_agent.agents.push.networks import Table, Twins
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens
+from tangram_agent.agents.push.seen import beside
 from tangram_agent.base.acting import NetworkActor
 from tangram_core.arrays import Floats, Ints, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
-from tangram_tasks.push.places import on_table
 from tangram_tasks.push.task import Push
 from tangram_tasks.push.trials import Trials, middle
 
@@ -54,7 +54,8 @@ class PushActor(NetworkActor):
         drawn, any_push = self._drawn(len(corners), explore)
         times = 1 if explore is not None else _SURE
         most = max(1, tried) if explore is None else 1
-        _, slots, found = self._best(scene, drawn, times * self._config.looked_at, most)
+        pairs, looked_at = self._pairs(scene), times * self._config.looked_at
+        _, slots, found = self._best(scene, pairs, drawn, looked_at, most)
         which = scene.which.gather(1, slots)
         if most > 1:
             at = self._tried(corners, goals, tokens.actions[which.numpy(), found.numpy()])[:, None]
@@ -71,32 +72,41 @@ class PushActor(NetworkActor):
         return actions
 
     def _best(
-        self, scene: Scene, drawn: torch.Tensor, looked_at: int, most: int
+        self, scene: Scene, pairs: torch.Tensor, drawn: torch.Tensor, looked_at: int, most: int = 1
     ) -> tuple[torch.Tensor, ...]:
-        """See `best`, of all tokens of every table."""
-        slots = torch.arange(self._task.count).expand(len(scene.present), -1)
+        """See `best`."""
         network, count = self.network, min(looked_at, PUSHES)
         with torch.no_grad():
             moved = network.table.moved
-            return best(network.critic, moved, self._tokens, scene, slots, drawn, count, most)
+            return best(network.critic, moved, self._tokens, scene, pairs, drawn, count, most)
 
     def _tried(self, corners: Array, goals: Array, actions: Floats) -> torch.Tensor:
         """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine."""
-        task, known = self._task, middle(self._task)
+        known = middle(self._task)
         after = np.repeat(corners[:, None], actions.shape[1], axis=1)
-        for table in np.flatnonzero(~task.placed(corners, goals).all(axis=1)).tolist():
+        for table in np.flatnonzero(~self._task.placed(corners, goals).all(axis=1)).tolist():
             self._trials.begin(corners[table], goals[table], known)
             for number, push in enumerate(actions[table]):
                 found = self._trials.after(push)
                 after[table, number] = corners[table] if found is None else found
         flat, wanted = after.reshape(-1, *corners.shape[1:]), goals.repeat(actions.shape[1], axis=0)
-        placed = task.placed(flat, wanted)
-        drawn, _ = self._drawn(len(flat), None)
-        value, _, _ = self._best(self._tokens.scene(flat, wanted), drawn, self._config.looked_at, 1)
-        paid = task.paid(placed, on_table(wanted, task.layout))
-        goes_on = self._config.gamma * ~placed.all(axis=1)
-        worth = torch.from_numpy(paid) + torch.from_numpy(goes_on) * value[:, 0].clamp(max=0.0)
-        return worth.view(len(corners), -1).argmax(1)
+        return self._worth(self._tokens.scene(flat, wanted)).view(len(corners), -1).argmax(1)
+
+    def _worth(self, scene: Scene) -> torch.Tensor:
+        """(n,) of tables: of each token that is not in place its part of what its pair is worth."""
+        count, pairs = self._task.count, self._pairs(scene)
+        drawn, each = torch.arange(PUSHES).expand(pairs[0].numel(), -1), pairs.reshape(2, -1, 1)
+        value = self._best(scene.repeated(count), each, drawn, self._config.looked_at)[0]
+        left, least = scene.present & ~self._tokens.placed(scene), -1.0 / (1.0 - self._config.gamma)
+        worth = value.view(-1, count).clamp(least, -0.5)  # one more push at least
+        return (left * worth / (1.0 + left.gather(1, pairs[1]).float())).sum(1)
+
+    def _pairs(self, scene: Scene) -> torch.Tensor:
+        """(2, n, K) all tokens, and those beside them."""
+        count = self._task.count
+        slots = torch.arange(count).expand(len(scene.poses), -1)
+        others = beside(scene.repeated(count), slots.flatten())
+        return torch.stack([slots, others.view_as(slots)])
 
     @cached_property
     def _trials(self) -> Trials:

@@ -20,34 +20,38 @@ def best(
     moved: Tensor,
     tokens: Tokens,
     scene: Scene,
-    slots: Tensor,
+    pairs: Tensor,
     drawn: Tensor,
     count: int,
     most: int = 1,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The best pushes of each table: their values (n, M), slots of their tokens, and which.
 
-    One critic chooses, the lesser of both says what they are worth.
+    One critic chooses, the lesser of both says what they are worth: until a token and the one
+    beside it are in their places. Where both are, the token is not pushed.
 
     Args:
         critics: who value.
         moved: (S, 1024, 3) what pushes do to tokens alone.
         tokens: the set.
         scene: n tables.
-        slots: (n, k) of the tokens that may be pushed.
+        pairs: (2, n, k) slots of the tokens that may be pushed, and of those beside them.
         drawn: (n * k, P) numbers of pushes.
         count: of pushes of each token that are looked at: the half after which least is left to go
             if it is alone, and the first that were drawn.
         most: M.
     """
-    size, each = slots.shape
-    seen = seen_by(tokens, scene.repeated(each), slots.flatten())
+    _, size, each = pairs.shape
+    flat, beside = pairs.flatten(1)
+    seen = seen_by(tokens, scene.repeated(each), flat, beside)
     which = _looked_at(tokens, seen, moved, drawn, count)
     own = seen.which[:, None]
     numbers, never = pushes(
         tokens, seen, tokens.begins[own, which], tokens.ends[own, which], moved[own, which]
     )
-    never = never | ~scene.present.gather(1, slots).flatten()[:, None]
+    one = torch.arange(size, device=drawn.device).repeat_interleave(each)
+    done = tokens.placed(scene) | ~scene.present
+    never = never | ((done[one, flat] & done[one, beside]) | ~scene.present[one, flat])[:, None]
     values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
     most = min(most, values.shape[1])
     values, at = values.topk(most, dim=1) if most > 1 else values.max(1, keepdim=True)
@@ -55,7 +59,7 @@ def best(
     row = torch.arange(size, device=drawn.device)[:, None] * each + slot
     rows = row.flatten()
     other = critics.one(1, _only(seen, rows), numbers[row, push].view(len(rows), 1, -1))
-    return torch.minimum(values, other.view_as(values)), slots.gather(1, slot), which[row, push]
+    return torch.minimum(values, other.view_as(values)), pairs[0].gather(1, slot), which[row, push]
 
 
 def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: int) -> Tensor:
@@ -70,4 +74,4 @@ def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: 
 
 def _only(seen: Seen, rows: Tensor) -> Seen:
     """With what critics see of these rows alone."""
-    return replace(seen, token=seen.token[rows], others=seen.others[rows], there=seen.there[rows])
+    return replace(seen, token=seen.token[rows], other=seen.other[rows], there=seen.there[rows])

@@ -1,5 +1,8 @@
 """Learning in the master: Q-learning over the pushes that are looked at, with hindsight.
 
+Of many tokens two are learned from at a time, the one that was pushed and the one beside it: until
+both are in place, nobody pushes another. What it costs to push others out of theirs is set.
+
 Legend: B transitions, K tokens, V corners, P pushes drawn for each token.
 """
 
@@ -18,7 +21,7 @@ from tangram_agent.agents.push.agent import PushingConfig
 from tangram_agent.agents.push.choosing import best
 from tangram_agent.agents.push.networks import Alone, Twins
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, rotated
-from tangram_agent.agents.push.seen import pushes, seen_by
+from tangram_agent.agents.push.seen import beside, pushes, seen_by
 from tangram_agent.base.learning import Loss, NetworkLearner, Rates
 from tangram_agent.flat.config import EpisodeConfig
 from tangram_agent.flat.replay import EpisodeReplay
@@ -30,7 +33,8 @@ from tangram_tasks.push.places import ways_of
 from tangram_tasks.push.task import Push
 
 _DRAWN = 96  # P: pushes of which those are taken that a target looks at
-_TOKENS = 3  # k: tokens whose pushes a target looks at, rather those that are not in place
+_PAIR = 2  # tokens whose pushes a target looks at
+_LOST = 2.0  # what it costs to push a third token out of its place: some pushes until it is back
 _RENEWED = 20  # updates after which the table of pushes is
 _LAST = 0.1  # share of the learning rate that is left at the end of a budget
 _STILL = 1e-4  # way of a token that did not move
@@ -44,10 +48,9 @@ class Batch:
     Attributes:
         poses, following, goals: (B, K, 3) where tokens were, came to, and should come.
         which, present: (B, K) see `Scene`.
-        slots: (B,) of the token that was pushed.
+        slots, others: (B,) of the token that was pushed, and of the one beside it.
         begins, ends: (B, 2) of the finger, on the table.
-        order: (B, K) random numbers in [0, 1).
-        drawn: (B * k, P) pushes that may be the best that follows.
+        drawn: (2 * B, P) pushes that may be the best that follows.
     """
 
     poses: Tensor
@@ -56,9 +59,9 @@ class Batch:
     which: Tensor
     present: Tensor
     slots: Tensor
+    others: Tensor
     begins: Tensor
     ends: Tensor
-    order: Tensor
     drawn: Tensor
 
     @property
@@ -175,18 +178,18 @@ class PushLearner(NetworkLearner):
         corners = before.astype(np.float64)
         pushed, begins, ways = ways_of(task.layout, corners, actions, finger, longest)
         scene = self._tokens.scene(before, desired)
-        order = rng["replay"].random((config.batch_size, task.count))
-        size = (config.batch_size * min(_TOKENS, task.count), _DRAWN)
+        slots = (scene.which == self.tensor(pushed, np.int64)[:, None]).int().argmax(1)
+        size = (_PAIR * config.batch_size, _DRAWN)
         self.batch = batch = Batch(
             scene.poses,
             self._tokens.poses(following, scene.which),
             scene.goals,
             scene.which,
             scene.present,
-            (scene.which == self.tensor(pushed, np.int64)[:, None]).int().argmax(1),
+            slots,
+            beside(scene, slots),
             self.tensor(begins),
             self.tensor(begins + ways),
-            self.tensor(order),
             self.tensor(rng["replay"].integers(PUSHES, size=size), np.int64),
         )
         return batch
@@ -197,19 +200,17 @@ class PushLearner(NetworkLearner):
         poses = torch.zeros(size, count, 3, device=self.place)
         which = torch.zeros(size, count, dtype=torch.int64, device=self.place)
         ways = torch.zeros(size, 2, device=self.place)
-        drawn = torch.zeros(
-            size * min(_TOKENS, count), _DRAWN, dtype=torch.int64, device=self.place
-        )
+        drawn = torch.zeros(_PAIR * size, _DRAWN, dtype=torch.int64, device=self.place)
         scene = poses, poses.clone(), poses.clone(), which, which == 0
-        push = which[:, 0].clone(), ways, ways.clone()
-        yield Batch(*scene, *push, poses[..., 0].clone(), drawn)
+        push = which[:, 0].clone(), which[:, 0].clone(), ways, ways.clone()
+        yield Batch(*scene, *push, drawn)
 
     def losses(self, seen: Batch) -> Iterator[Loss]:
         """What pushes do to a token alone, and what they are worth."""
         tokens = self._tokens
         with torch.no_grad():
             target = self._target(seen)
-            view = seen_by(tokens, seen.at(seen.poses), seen.slots)
+            view = seen_by(tokens, seen.at(seen.poses), seen.slots, seen.others)
             turn = -view.pose[:, 2]
             ends = (rotated(at - view.pose[:, :2], turn) for at in (seen.begins, seen.ends))
             begin, end = ends
@@ -227,14 +228,15 @@ class PushLearner(NetworkLearner):
         tokens, config = self._tokens, self.config
         critic: Twins = self.targets["critic"]  # type: ignore[assignment]
         scene, count = seen.at(seen.following), config.targets_looked_at
-        placed = tokens.placed(scene)
-        first = seen.order + 2.0 * scene.present + (~placed & scene.present)
-        slots = first.topk(min(_TOKENS, first.shape[1]), dim=1).indices
-        value = best(critic, self.table.moved, tokens, scene, slots, seen.drawn, count)[0][:, 0]
+        pair = torch.stack([seen.slots, seen.others], dim=1)
+        pairs = torch.stack([pair, pair.flip(1)])
+        value = best(critic, self.table.moved, tokens, scene, pairs, seen.drawn, count)[0][:, 0]
         least = -1.0 / (1.0 - config.gamma)
-        counts = scene.present.sum(1)
-        reward = (placed & scene.present).sum(1) / counts - 1.0  # as the task pays it
-        goes_on = ~(placed | ~scene.present).all(1)
+        before, after = (tokens.placed(one) for one in (seen.at(seen.poses), scene))
+        lost = (before & ~after & scene.present).scatter(1, pair, value=False).sum(1)
+        there, placed = scene.present.gather(1, pair), after.gather(1, pair)
+        reward = (placed & there).sum(1) / there.sum(1) - 1.0 - _LOST * lost  # of two as the task
+        goes_on = ~(placed | ~there).all(1)
         target = reward + config.gamma * goes_on * value.clamp(least, 0.0)
         return target.clamp(least, 0.0)
 

@@ -17,7 +17,7 @@ _FAR = 0.2  # of a token that is pushed
 
 
 class Critic(nn.Module):
-    """Values of pushes: the others as a sum over them, then each push beside it."""
+    """Values of pushes: the token and another one, then each push beside them."""
 
     def __init__(self, corners: int, width: int) -> None:
         super().__init__()
@@ -32,8 +32,8 @@ class Critic(nn.Module):
 
     def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
         """(n, N) of pushes (n, N, 22)."""
-        others = (self.other(seen.others) * seen.there[..., None]).sum(1)
-        scene = self.scene(self.mixed(self.token(seen.token) + self.others(others)))
+        other = self.others(self.other(seen.other) * seen.there)
+        scene = self.scene(self.mixed(self.token(seen.token) + other))
         value: Tensor = self.value(scene[:, None] + self.push(pushes))
         return value.squeeze(-1)
 

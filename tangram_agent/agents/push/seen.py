@@ -1,5 +1,8 @@
 """What networks see of tokens and of pushes, in the frame of the token that is pushed.
 
+They see one other token beside it, the one that matters most, and of all the others only how near
+a push comes to them. So what they learn of two tokens holds for seven.
+
 Legend: n rows, each with a token that may be pushed; K tokens of a row, C corners, N pushes.
 """
 
@@ -37,62 +40,74 @@ def other_numbers(corners: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Tokens, as one of them sees the others.
+    """A token, and what it sees of the others.
 
     Attributes:
         token: (n, F) itself.
-        others: (n, K - 1, G).
-        there: (n, K - 1) 1 where there is one.
-        placed: (n, K - 1) whether it is in its place.
+        other: (n, G) the one that matters most.
+        there: (n, 1) 1 where there is such a one.
         pose, left: (n, 3) its pose, and its way to its place, in its own frame.
         which: (n,) token of the set.
-        outlines: (2, C, n, K - 1) of the others, on the table.
+        outlines: (2, C, n, K - 1) of all others, on the table.
+        placed: (n, K - 1) which of these are in their places.
     """
 
     token: Tensor
-    others: Tensor
+    other: Tensor
     there: Tensor
-    placed: Tensor
     pose: Tensor
     left: Tensor
     which: Tensor
     outlines: Tensor
+    placed: Tensor
 
 
-def seen_by(tokens: Tokens, scene: Scene, slots: Tensor) -> Seen:
-    """What the tokens in slots (n,) see."""
+def beside(scene: Scene, slots: Tensor) -> Tensor:
+    """(n,) the tokens that matter most to those in slots (n,): nearest to them, or to their places.
+
+    Where there is no other, any that is not there, or the token itself.
+    """
+    rows = torch.arange(len(slots), device=slots.device)
+    here, goal = (of[rows, slots, None, :2] for of in (scene.poses, scene.goals))
+    there = scene.poses[..., :2]
+    far = torch.minimum((there - here).norm(dim=-1), (there - goal).norm(dim=-1))
+    own = torch.arange(far.shape[1], device=slots.device) == slots[:, None]
+    return torch.where(own | ~scene.present, torch.inf, far).argmin(1)
+
+
+def seen_by(tokens: Tokens, scene: Scene, slots: Tensor, others: Tensor) -> Seen:
+    """What the tokens in slots (n,) see, beside them those in others (n,)."""
     rows, count = torch.arange(len(slots), device=slots.device), scene.poses.shape[1]
     left = tokens.left(scene.poses, scene.goals, scene.which)
     pose, which, own = scene.poses[rows, slots], scene.which[rows, slots], left[rows, slots]
     token = [ways(tokens, own), tokens.outlines[which].flatten(1) * _LARGE, edge(pose[:, :2])]
-    other = (slots[:, None] + torch.arange(1, count, device=slots.device)) % count
-    at = rows[:, None], other
-    poses, goals, kinds = scene.poses[at], scene.goals[at], scene.which[at]
-    outlines = tokens.laid(poses, kinds)
+    x, y, cos, sin = *pose[:, :2].T, pose[:, 2].cos(), pose[:, 2].sin()
 
-    x, y, cos, sin = (one[:, None] for one in (*pose[:, :2].T, pose[:, 2].cos(), pose[:, 2].sin()))
-
-    def here(points: Tensor) -> Tensor:  # (..., n, K - 1, 2) in the token's frame, of (2, ...)
+    def here(points: Tensor) -> Tensor:  # (..., n, 2) in the token's frame, of (2, ..., n)
         right, up = points[0] - x, points[1] - y
         return torch.stack([cos * right + sin * up, cos * up - sin * right], dim=-1)
 
     def heading(angles: Tensor) -> Tensor:
-        turn = angles - pose[:, None, 2]
+        turn = angles - pose[:, 2]
         return torch.stack([torch.cos(turn), torch.sin(turn)], dim=-1)
 
-    left_of_others = left[at]
-    others = [
-        ways(tokens, left_of_others),
-        tokens.outlines[kinds].flatten(2) * _LARGE,
-        here(poses.movedim(-1, 0)),
-        heading(poses[..., 2]),
-        here(outlines).permute(1, 2, 0, 3).flatten(2),
-        here(goals.movedim(-1, 0)),
-        heading(goals[..., 2]),
+    at = rows, others
+    poses, goals, kinds = scene.poses[at], scene.goals[at], scene.which[at]
+    other = [
+        ways(tokens, left[at]),
+        tokens.outlines[kinds].flatten(1) * _LARGE,
+        here(poses.T),
+        heading(poses[:, 2]),
+        here(tokens.laid(poses, kinds)).movedim(0, 1).flatten(1),
+        here(goals.T),
+        heading(goals[:, 2]),
     ]
-    there = scene.present[at].to(pose.dtype)
-    seen = torch.cat(token, dim=-1), torch.cat(others, dim=-1), there, tokens.near(left_of_others)
-    return Seen(*seen, pose, own, which, outlines)
+    there = (scene.present[at] & (others != slots)).to(pose.dtype)[:, None]
+    each = (slots[:, None] + torch.arange(1, count, device=slots.device)) % count
+    every = rows[:, None], each
+    outlines = tokens.laid(scene.poses[every], scene.which[every])
+    seen = torch.cat(token, dim=-1), torch.cat(other, dim=-1), there
+    return Seen(*seen, pose, own, which, outlines, tokens.near(left[every]))
 
 
 def ways(tokens: Tokens, left: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,9 @@ from shapely.geometry import Point, Polygon
 
 from tangram_agent.agents.push.actor import PushActor
 from tangram_agent.agents.push.agent import Pushing, PushingConfig
-from tangram_agent.agents.push.learner import PushLearner, PushReplay
+from tangram_agent.agents.push.learner import Batch, PushLearner, PushReplay
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, distance, gap, rotated
-from tangram_agent.agents.push.seen import pushes, seen_by
+from tangram_agent.agents.push.seen import beside, pushes, seen_by
 from tangram_core.agent import Learner
 from tangram_core.conformance import check_agent, play
 from tangram_core.errors import ConfigError
@@ -95,25 +96,65 @@ def test_what_is_seen_hangs_on_no_frame_but_the_tokens_own() -> None:
     slots = torch.tensor([0, 1, 0, 1, 0])
 
     def views(of: Scene) -> tuple[torch.Tensor, torch.Tensor]:
-        seen = seen_by(tokens, of, slots)
-        return seen.token[:, :-1], seen.others  # but how near the edge is
+        seen = seen_by(tokens, of, slots, 1 - slots)
+        return seen.token[:, :-1], seen.other  # but how near the edge is
 
     for here, there in zip(views(found), views(moved(found, 2.0, 0.1, -0.2)), strict=True):
         torch.testing.assert_close(here, there, atol=1e-4, rtol=1e-4)
 
 
 def test_a_token_that_is_not_there_is_not_seen() -> None:
-    tokens, agent = Tokens(SOME, CPU), Pushing(SMALL)
-    critic = agent.learner(SOME, 0, "cpu").critic  # type: ignore[attr-defined]
-    found = scene(SOME, 4)
-    gone = replace(found, present=torch.tensor([[True, True, False]]).expand(4, 3))
+    tokens, agent = Tokens(TWO, CPU), Pushing(SMALL)
+    critic = agent.learner(TWO, 0, "cpu").critic  # type: ignore[attr-defined]
+    found = scene(TWO, 4)
+    gone = replace(found, present=torch.tensor([[True, False]]).expand(4, 2))
     poses = gone.poses.clone()
-    poses[:, 2] += 5.0
+    poses[:, 1] += 5.0
     slots, zeros = torch.zeros(4, dtype=torch.int64), torch.zeros(4, 1, 22)
     values = [
-        critic(seen_by(tokens, one, slots), zeros) for one in (gone, replace(gone, poses=poses))
+        critic(seen_by(tokens, one, slots, slots + 1), zeros)
+        for one in (gone, replace(gone, poses=poses))
     ]
     torch.testing.assert_close(values[0], values[1])
+
+
+def test_beside_a_token_is_what_lies_nearest_to_it_or_to_its_place() -> None:
+    found = scene(SOME, 1)
+    places = torch.tensor([[[-0.5, 0.0, 0.0], [0.1, 0.0, 0.0], [0.6, 0.0, 0.0]]])
+    found = replace(found, poses=places, goals=places)
+    slots = torch.arange(3)
+
+    def nearest(one: Scene) -> list[int]:
+        return beside(one.repeated(3), slots).tolist()
+
+    assert nearest(found) == [1, 2, 1]
+    goals = places.clone()
+    goals[0, 1, 0] = -0.4  # the middle one must come beside the first
+    assert nearest(replace(found, goals=goals)) == [1, 0, 1]
+    gone = replace(found, present=torch.tensor([[True, False, True]]))
+    assert nearest(gone)[0] == 2
+
+
+def test_pushes_near_tokens_in_their_places_are_told_from_those_near_others() -> None:
+    tokens, found = Tokens(TWO, CPU), scene(TWO, 6)
+    poses = found.poses.clone()
+    poses[:, 0], poses[:, 1] = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([0.3, 0.0, 0.0])
+    slots, others = torch.zeros(6, dtype=torch.int64), torch.ones(6, dtype=torch.int64)
+    which = torch.arange(PUSHES).expand(6, -1)
+    own = found.which[:, :1]
+
+    def near(goals: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        seen = seen_by(tokens, replace(found, poses=poses, goals=goals), slots, others)
+        ways = tokens.begins[own, which], tokens.ends[own, which]
+        numbers = pushes(tokens, seen, *ways, torch.zeros(6, PUSHES, 3))[0]
+        return numbers[..., -8:-4], numbers[..., -4:]
+
+    placed, other = near(poses)
+    assert (other == 1.0).all()
+    assert placed.min() < -0.3
+    away, left = near(poses + 0.5)
+    assert (away == 1.0).all()
+    torch.testing.assert_close(left, placed)
 
 
 def test_pushes_that_are_looked_at_are_those_that_the_table_makes() -> None:
@@ -125,7 +166,7 @@ def test_pushes_that_are_looked_at_are_those_that_the_table_makes() -> None:
     corners = seen["corners"]
     found = tokens.scene(corners, seen["goals"])
     slots = torch.from_numpy(rng.integers(3, size=count))
-    view = seen_by(tokens, found, slots)
+    view = seen_by(tokens, found, slots, beside(found, slots))
     which = torch.from_numpy(rng.integers(PUSHES, size=(count, 30)))
     own = view.which[:, None]
     begins, ends = tokens.begins[own, which], tokens.ends[own, which]
@@ -191,23 +232,41 @@ def test_hindsight_takes_whole_tokens_of_what_was_reached() -> None:
 
 def test_targets_pay_and_end_as_the_task_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a discount of 0 and of 1 for a value of -1."""
-    loose = Push(SOME.tokens, replace(SOME.config, within=0.3, turned=1.5))
-    agent = Pushing(replace(SMALL, gamma=0.9, batch_size=100, relabel_share=0.9))
-    learner = agent.learner(loose, 0, "cpu")
-    assert isinstance(learner, PushLearner)
-    rng = {name: np.random.default_rng(i) for i, name in enumerate(learner.streams)}
-    learner.insert(played(loose, learner, agent).episodes, rng)
-    chosen = {}
-    real = learner.replay.chosen
-    monkeypatch.setattr(learner.replay, "chosen", lambda *a: chosen.setdefault("found", real(*a)))
-    monkeypatch.setattr(
-        "tangram_agent.agents.push.learner.best",
-        lambda *a: (torch.full((100, 1), -1.0), None, None),
-    )
-    targets = learner._target(learner.drawn(rng)).numpy()
-    rows, steps, desired = chosen["found"]
+    loose = Push(TWO.tokens, replace(TWO.config, within=0.3, turned=1.5))
+    learner, seen, (rows, steps, desired) = learned_from(loose, monkeypatch)
+    targets = learner._target(seen).numpy()
     achieved = learner.replay.arrays["corners"][rows, steps + 1]
     ended = loose.ended(achieved, desired, np.zeros(100, bool))
     expected = loose.rewards(achieved, desired) - 0.9 * ~ended
     assert 5 < ended.sum() < 95
     np.testing.assert_allclose(targets, expected, atol=1e-6)
+
+
+def test_of_three_tokens_a_pair_is_paid_and_a_third_that_is_pushed_away_costs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    learner, seen, _ = learned_from(SOME, monkeypatch)
+    poses, rows = torch.zeros(100, 3, 3), torch.arange(100)
+    third = 3 - seen.slots - seen.others
+    seen = replace(seen, poses=poses, goals=poses, following=poses.clone())
+    assert (learner._target(seen) == 0.0).all()  # both are in place: the end
+    seen.following[rows, third, 0] = 0.5
+    assert (learner._target(seen) == -2.0).all()
+    seen.following[rows, seen.slots, 0] = 0.5
+    torch.testing.assert_close(learner._target(seen), torch.full((100,), -2.0 - 0.5 - 0.9))
+
+
+def learned_from(task: Push, monkeypatch: pytest.MonkeyPatch) -> tuple[PushLearner, Batch, Any]:
+    """A learner that holds the following for worth -1, a batch, and what was drawn for it."""
+    agent = Pushing(replace(SMALL, gamma=0.9, batch_size=100, relabel_share=0.9))
+    learner = agent.learner(task, 0, "cpu")
+    assert isinstance(learner, PushLearner)
+    rng = {name: np.random.default_rng(i) for i, name in enumerate(learner.streams)}
+    learner.insert(played(task, learner, agent).episodes, rng)
+    found = learner.replay.chosen(learner.config, rng)
+    monkeypatch.setattr(learner.replay, "chosen", lambda *_: found)
+    monkeypatch.setattr(
+        "tangram_agent.agents.push.learner.best",
+        lambda *_: (torch.full((100, 1), -1.0), None, None),
+    )
+    return learner, learner.drawn(rng), found
