@@ -93,13 +93,13 @@ class PushActor(NetworkActor):
         return self._worth(self._tokens.scene(flat, wanted)).view(len(corners), -1).argmax(1)
 
     def _worth(self, scene: Scene) -> torch.Tensor:
-        """(n,) of tables: of each token that is not in place its part of what its pair is worth."""
+        """(n,) of tables: what the pairs of those tokens that are not in place are worth."""
         count, pairs = self._task.count, self._pairs(scene)
         drawn, each = torch.arange(PUSHES).expand(pairs[0].numel(), -1), pairs.reshape(2, -1, 1)
         value = self._best(scene.repeated(count), each, drawn, self._config.looked_at)[0]
         left, least = scene.present & ~self._tokens.placed(scene), -1.0 / (1.0 - self._config.gamma)
         worth = value.view(-1, count).clamp(least, -0.5)  # one more push at least
-        return (left * worth / (1.0 + left.gather(1, pairs[1]).float())).sum(1)
+        return (left * worth).sum(1)
 
     def _pairs(self, scene: Scene) -> torch.Tensor:
         """(2, n, K) all tokens, and those beside them."""

@@ -28,7 +28,7 @@ def best(
     """The best pushes of each table: their values (n, M), slots of their tokens, and which.
 
     One critic chooses, the lesser of both says what they are worth: until a token and the one
-    beside it are in their places. Where both are, the token is not pushed.
+    beside it are in their places. Those in their places are not pushed.
 
     Args:
         critics: who value.
@@ -50,8 +50,8 @@ def best(
         tokens, seen, tokens.begins[own, which], tokens.ends[own, which], moved[own, which]
     )
     one = torch.arange(size, device=drawn.device).repeat_interleave(each)
-    done = tokens.placed(scene) | ~scene.present
-    never = never | ((done[one, flat] & done[one, beside]) | ~scene.present[one, flat])[:, None]
+    left = scene.present & ~tokens.placed(scene)
+    never = never | ~left[one, flat][:, None]
     values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
     most = min(most, values.shape[1])
     values, at = values.topk(most, dim=1) if most > 1 else values.max(1, keepdim=True)
