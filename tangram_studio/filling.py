@@ -80,7 +80,7 @@ def fill(asked: Fill) -> Answer:
     """
     if sum(one is not None for one in (asked.puzzle, asked.outlines, asked.pieces)) != 1:
         raise ConfigError("a puzzle, a drawing or pieces are to be filled, one of them")
-    layout, scale = player("lift").layout, player("lift").run.task.tokens.scale
+    layout, scale = player().layout, player().run.task.tokens.scale
     if asked.puzzle is not None:
         load_puzzle(asked.puzzle)  # a name of the library, not of a file
         return _filled(asked.puzzle, "the puzzle", asked.who)
@@ -122,7 +122,7 @@ def fill_file(name: str, data: bytes, who: str) -> Answer:
 
 def tans() -> dict[str, object]:
     """What a page is told at first: the tokens, their full square's side and area, the library."""
-    own = player("lift")
+    own = player()
     layout, scale = own.layout, own.run.task.tokens.scale
     chiral = layout.chiral.tolist()
     tokens = [
@@ -148,7 +148,7 @@ def tans() -> dict[str, object]:
 
 
 def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
-    task = player("lift").run.task
+    task = player().run.task
     layout = task.layout
     seconds = FREE_SECONDS if free else SECONDS
     drawn = fill_silhouette(name, source, layout, task.tokens.scale, seconds, method=_method(who))
@@ -169,7 +169,7 @@ def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
 
 @lru_cache(maxsize=2)
 def _method(who: str) -> Method:
-    method = together(player("lift").layout)
+    method = together(player().layout)
     return replace(method, search=False) if who == "agent" else method
 
 
@@ -178,7 +178,7 @@ def _called(who: str, by: str) -> str:
 
 
 def _answer(drawn: Silhouette, found: Dissection, exact: bool, iou: float, how: str) -> Answer:
-    task = player("lift").run.task
+    task = player().run.task
     layout = task.layout
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
     check_inside("the figure", task, layout.corners(poses, found.flipped), "draw it less long")

@@ -21,7 +21,7 @@ Number = Annotated[float, Meta(ge=-FAR, le=FAR)]
 Count = Annotated[int, Meta(ge=0, lt=2**53)]
 Point = tuple[Number, Number]
 Ring = Annotated[list[Point], Meta(min_length=3, max_length=MAX_POINTS)]
-Motion = Literal["lift", "slide"]
+Motion = Literal["lift", "push"]
 Who = Literal["together", "agent"]
 
 
@@ -70,7 +70,7 @@ class Play(Struct, tag_field="ask", tag="play", forbid_unknown_fields=True):
         goal: the figure.
         start: where the tokens lie; None: anywhere beside it.
         shown: moves of the same figure that the page had begun to show; others are forgotten.
-        motion: whether tokens are carried or pushed.
+        motion: whether tokens are carried, or pushed by a finger.
     """
 
     number: Count

@@ -1,6 +1,6 @@
-"""One move after the other: a player chooses a token and a motion, the engine moves it.
+"""One move after the other: an agent chooses a token and a motion, the engine moves it.
 
-What is carried is moved by the agent, what is pushed by a rule that learned nothing.
+Tokens are carried by one agent, or pushed by a finger, which another one leads.
 
 Nothing is kept between two moves but what is given, so a page may change the scene at any time.
 "Placed" is what lies in its piece: what was dragged or pushed away is moved again.
@@ -8,28 +8,30 @@ Nothing is kept between two moves but what is given, so a page may change the sc
 Legend: K tokens, F frames.
 """
 
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 
-from tangram_agent.runs import Run, load_changed
+from tangram_agent.runs import Run, load_changed, load_run
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.task import History
 from tangram_sim.batch import BatchedEnv, Starts
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.motion.actions import chosen_tokens
-from tangram_sim.world.world import World, make_world
+from tangram_sim.world.pushing import PushTable
 from tangram_tasks.metrics import iou
 from tangram_tasks.pairing import paired
-from tangram_tasks.rivals.sweeps import sweep_policy
+from tangram_tasks.push.env import PushEnv
+from tangram_tasks.push.places import push_of
+from tangram_tasks.push.task import Push
 from worker.play.rollout import greedy
 
-AGENT = "pretrained/tangram7"
-SIM = {"lift": {}, "slide": {"motion": "slide", "actions_per_token": 2}}
+AGENT, FINGER = "pretrained/tangram7", "pretrained/hand"
 PARTS = 20  # of a push, as it is shown
 _NEAR, _STRAIGHT = 0.01, 0.03  # arena units and radians: what lies in its piece
 _STILL = 1e-3  # what moved less has not moved
@@ -63,6 +65,7 @@ class Move:
     Attributes:
         token: that was moved; None where none was.
         frames: (F, K, 3) poses at equal times of a second, the first before it and the last after.
+        finger: (F, 2) where it is then, where one pushes.
         blocked: the token could not be set down on others, and lies where it was.
         coverage: share of the figure that is covered after it.
         iou: area that tokens and figure share over the area of both together.
@@ -77,56 +80,89 @@ class Move:
     iou: float
     done: Round
     ended: bool
+    finger: Floats | None = None
 
 
 class _Player:
-    """Who moves tokens, and the arena."""
+    """Who carries tokens, and the arena."""
 
-    def __init__(self, motion: str) -> None:
+    def __init__(self) -> None:
         torch.set_num_threads(1)  # more are slower for so little, above all beside other work
-        self.run: Run = load_changed(AGENT, {"sim": SIM[motion]})
-        task = self.run.task
-        self.layout, self.motion = task.layout, motion
-        sim = replace(task.sim.blind, starts="outside")
+        self.run: Run = load_run(AGENT)
+        self.layout = self.run.task.layout
+        sim = replace(self.run.task.sim.blind, starts="outside")
         self.env = BatchedEnv(self.layout, sim, RewardConfig(), 1)
-        slides = motion == "slide"
-        self.choose = sweep_policy(self.layout, sim) if slides else greedy(self.run.actor)
-        self._shown: World | None = make_world(self.layout, sim) if slides else None
-
-    def frames(self, before: Floats, after: Floats, flipped: Bools, token: int) -> Floats:
-        """(F, K, 3) of a move: what is carried goes straight, a push is played again in parts."""
-        if self._shown is None:
-            return np.stack([before, after])
-        way = (after - before)[token]
-        way[2] = (way[2] + np.pi) % (2.0 * np.pi) - np.pi
-        self._shown.place(before, flipped)
-        frames = [before]
-        for _ in range(PARTS - 1):
-            self._shown.move(token, way / PARTS)
-            frames.append(self._shown.poses())
-        return np.stack([*frames, after])
+        self.choose = greedy(self.run.actor)
 
 
-@lru_cache(maxsize=2)
-def player(motion: str) -> _Player:
-    """Who carries tokens, or pushes them."""
-    return _Player(motion)
+class _Finger:
+    """Who pushes them, on a table whose friction it is not told."""
+
+    def __init__(self) -> None:
+        torch.set_num_threads(1)
+        self._run: Run = load_changed(FINGER, {"task": {"count": 0}})
+        self._task = cast("Push", self._run.setup.task)
+        with closing(PushEnv(self._task, 1)) as env:
+            env.reset([np.random.default_rng(0)])
+            self._unknowns = env.unknowns[0]
+        self._table = PushTable(self._task.layout, self._task.config.finger)
+        self.most = self._task.spec.horizon
+
+    def push(self, scene: Sides, goal: Sides) -> tuple[Singles, int, Floats, Floats] | None:
+        """A push (1, 4), its token, frames (F, K, 3), and the finger's places (F, 2).
+
+        None where all lie in their places, or the finger cannot come down.
+
+        No push turns a token over: with one that lies on its other side, all is done in a mirror.
+        """
+        layout, config = self._task.layout, self._task.config
+        image = bool((scene.flipped & layout.chiral).any())
+        if image:
+            scene, goal = (Sides(*layout.mirrored(*one)) for one in (scene, goal))
+        corners, goals = (layout.corners(one.poses) for one in (scene, goal))
+        if self._task.placed(corners[None], goals[None]).all():
+            return None
+        seen = {"corners": corners[None], "goals": goals[None]}
+        action = self._run.act(seen)
+        push = push_of(layout, corners, action[0], config.finger, config.longest)
+        if push.refused:
+            return None
+        self._table.place(scene.poses, np.ones(layout.tokens, np.bool_), self._unknowns)
+        path = push.begin + np.linspace(0.0, 1.0, PARTS + 1)[:, None] * push.way
+        frames = np.repeat(scene.poses[None], len(path), axis=0)
+        for at in self._table.follow(path):
+            frames[at:] = self._table.poses()
+        if image:
+            frames, path = layout.mirrored(frames, scene.flipped)[0], path * (1.0, -1.0)
+        return action, int(chosen_tokens(action.astype(np.float64), layout.tokens)[0]), frames, path
 
 
-def begin(goal: Sides, motion: str, seed: int) -> Floats:
+@lru_cache(maxsize=1)
+def player() -> _Player:
+    """Who carries tokens."""
+    return _Player()
+
+
+@lru_cache(maxsize=1)
+def finger() -> _Finger:
+    """Who pushes them."""
+    return _Finger()
+
+
+def begin(goal: Sides, seed: int) -> Floats:
     """(K, 3) where the tokens lie at first, anywhere beside the figure.
 
     Raises:
         SamplingError: they find no room.
     """
-    env = player(motion).env
+    env = player().env
     env.reset([np.random.default_rng(seed % _SEEDS)], (goal.poses[None], goal.flipped[None]))
     poses: Floats = env.layout.poses(env.corners)[0]
     return poses
 
 
 def _nothing_done() -> Round:
-    env = player("lift").env
+    env = player().env
     corners = np.zeros((0, env.layout.corner_count, 2), np.float32)
     return Round(corners, np.zeros((0, env.action_size), np.float32))
 
@@ -141,14 +177,14 @@ def next_move(scene: Sides, goal: Sides, motion: str, done: Round | None) -> Mov
         done: the round until now; None: nothing yet.
     """
     done = _nothing_done() if done is None else done
-    own = player(motion)
+    if motion == "push":
+        return _next_push(scene, goal, done)
+    own = player()
     env, layout = own.env, own.layout
     used = np.bincount(
         chosen_tokens(done.actions.astype(np.float64), layout.tokens), minlength=layout.tokens
     )
-    placed = used >= env.sim.actions_per_token
-    if motion == "lift":  # what is pushed may have to make room
-        placed |= _placed(scene, goal)
+    placed = (used >= env.sim.actions_per_token) | _placed(scene, goal)
     starts = Starts(scene.poses[None], scene.flipped[None], placed[None])
     targets = goal.poses[None], goal.flipped[None]
     env.reset([np.random.default_rng(0)], targets, starts=starts)
@@ -165,15 +201,34 @@ def next_move(scene: Sides, goal: Sides, motion: str, done: Round | None) -> Mov
         after = layout.poses(env.corners)[0]
         if result.blocked[0] or np.abs(after - before).max() > _STILL:
             token, blocked = int(result.tokens[0]), bool(result.blocked[0])
-            frames = own.frames(before, after, scene.flipped, token)
-    coverage = overlap_share(env.corners, env.goals, layout)
-    shared = float(iou(layout, env.corners, coverage)[0])
-    return Move(token, frames, blocked, float(coverage[0]), shared, done, bool(placed.all()))
+            frames = np.stack([before, after])
+    after = _scores(Sides(frames[-1], scene.flipped), goal)
+    return Move(token, frames, blocked, *after, done, bool(placed.all()))
+
+
+def _next_push(scene: Sides, goal: Sides, done: Round) -> Move:
+    """The next push; a round has as many as an episode."""
+    own = finger()
+    found = own.push(scene, goal) if len(done.actions) < own.most else None
+    if found is None:
+        return Move(None, scene.poses[None], False, *_scores(scene, goal), done, ended=True)
+    action, token, frames, path = found
+    done = Round(done.corners, np.concatenate([done.actions.reshape(-1, 4), action]))
+    after = _scores(Sides(frames[-1], scene.flipped), goal)
+    return Move(token, frames, False, *after, done, ended=False, finger=path)
+
+
+def _scores(scene: Sides, goal: Sides) -> tuple[float, float]:
+    """Coverage and IoU."""
+    layout = player().layout
+    here, there = (layout.corners(one.poses, one.flipped)[None] for one in (scene, goal))
+    coverage = overlap_share(here, there, layout)
+    return float(coverage[0]), float(iou(layout, here, coverage)[0])
 
 
 def _placed(scene: Sides, goal: Sides) -> Bools:
     """(K,) tokens that lie in their pieces."""
-    layout = player("lift").layout
+    layout = player().layout
     here, there = (layout.corners(one.poses, one.flipped)[None] for one in (scene, goal))
     pairing = paired(layout, here, there)
     far = np.linalg.norm(pairing.way[0, :, :2], axis=-1)

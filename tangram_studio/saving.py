@@ -36,7 +36,7 @@ def gif(moves: Sequence[Move], goal: Sides) -> bytes:
     """
     if not moves:
         raise ConfigError("nothing was played yet: let the agent lay a figure first")
-    own = player("lift")
+    own = player()
     layout, arena = own.layout, own.run.task.sim.arena
     target = layout.corners(*goal)
     pictures = [
@@ -61,14 +61,15 @@ def _shown(move: Move) -> list[tuple[Floats, Held | None]]:
         way = frames[min(first + 1, len(frames) - 1)] - frames[first]
         way[:, 2] = wrap(way[:, 2])
         height = float(np.sin(np.pi * share)) if len(frames) == 2 else 0.0
-        held = None if move.token is None else Held(move.token, height, move.blocked)
+        finger = None if move.finger is None else move.finger[round(at)]
+        held = None if move.token is None else Held(move.token, height, move.blocked, finger)
         shown.append((frames[first] + (at - first) * way, held))
     return shown
 
 
 def svg(tokens: Sides) -> bytes:
     """The tokens as they lie, a polygon each, y down."""
-    own = player("lift")
+    own = player()
     layout, half = own.layout, own.run.task.sim.arena / 2.0
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{-half:g} {-half:g} {2 * half:g} '
@@ -87,7 +88,7 @@ def puzzle_file(tokens: Sides, name: str) -> bytes:
     Raises:
         ConfigError: they are no figure, as where they lie on each other.
     """
-    own = player("lift")
+    own = player()
     layout, scale = own.layout, own.run.task.tokens.scale
     pieces = [
         {"shape": shape.name, "corners": (corners / scale).round(_DIGITS).tolist()}

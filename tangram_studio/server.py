@@ -27,7 +27,7 @@ from tangram_studio.config import StudioConfig
 from tangram_studio.filling import fill_file, tans
 from tangram_studio.jobs import Jobs
 from tangram_studio.messages import MAX_BYTES, write
-from tangram_studio.playing import player
+from tangram_studio.playing import finger, player
 from tangram_studio.session import LOST, Session, plain
 
 HOST = "127.0.0.1"
@@ -277,8 +277,8 @@ async def _left(request: Request) -> None:
 
 def warm() -> None:
     """Load what every process needs."""
-    player("lift")
-    player("slide")
+    player()
+    finger()
 
 
 async def _told(page: WebSocket, text: str) -> None:

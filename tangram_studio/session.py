@@ -29,7 +29,7 @@ class Game:
 
     Attributes:
         goal: the figure.
-        motion: whether tokens are carried or pushed.
+        motion: whether tokens are carried, or pushed by a finger.
         scene: the tokens as they lie.
         done: the round until now; None: nothing yet.
         rounds: before it.
@@ -135,8 +135,7 @@ class Session:
         goal = Sides(*asked.goal.sides)
         if asked.start is None:
             seed = secrets.randbelow(2**31)
-            given = goal, asked.motion, seed
-            poses = await self._moves.do(playing.begin, *given, waits=self._waits)
+            poses = await self._moves.do(playing.begin, goal, seed, waits=self._waits)
             scene, self._played, self._sent = Sides(poses, goal.flipped), [], 0
         else:
             scene = Sides(*asked.start.sides)
@@ -164,6 +163,7 @@ class Session:
             "move",
             token=move.token,
             frames=move.frames.round(5).tolist(),
+            finger=None if move.finger is None else move.finger.round(5).tolist(),
             flipped=game.scene.flipped.tolist(),
             blocked=move.blocked,
             lifts=game.motion == "lift",

@@ -30,6 +30,7 @@ _OPACITY = 0.9
 _INK = (31, 41, 55)
 _RED = (200, 40, 40)
 _NEARER = 0.12  # how much larger a piece in the hand looks
+_FINGER = 0.04  # its radius
 _SHADOW = 0.35  # its opacity
 _SHADOW_WAY = (0.03, -0.05)  # of the arena, to the right and down
 _SHADOW_BLUR = 0.012  # of the picture's side
@@ -45,11 +46,13 @@ class Held:
         token: its number.
         height: 0 on the table to 1 in the air: drawn larger, with a shadow.
         stopped: it cannot be set down: drawn with a red outline.
+        finger: (2,) of the middle of what pushes it.
     """
 
     token: int
     height: float = 0.0
     stopped: bool = False
+    finger: Floats | None = None
 
 
 def draw_game(
@@ -122,6 +125,9 @@ def _draw_held(canvas: Image.Image, arena: float, held: Held, corners: Floats) -
     piece = to_points(arena, nearer, canvas.width)
     fill(canvas, piece, colour_of(held.token), 1.0)
     draw_outline(canvas, piece, _RED if held.stopped else _INK, 2.0)
+    if held.finger is not None:
+        ends = held.finger + np.array([[-_FINGER, _FINGER], [_FINGER, -_FINGER]])
+        ImageDraw.Draw(canvas).ellipse(to_points(arena, ends, canvas.width), _INK)
 
 
 def _draw_shadow(canvas: Image.Image, outline: Sequence[Point], height: float) -> None:

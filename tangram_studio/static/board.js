@@ -38,8 +38,9 @@ export class Board {
     this.wanted = make("path", { class: "wanted", d: "" });
     this.tans = tokens.map((token, k) => this.tan(token, k));
     this.shadow = make("polygon", { class: "shadow" });
+    this.finger = make("circle", { class: "finger", r: 0.04 });
     this.ink = make("g");
-    this.table.append(this.goal, this.wanted, ...this.tans, this.ink);
+    this.table.append(this.goal, this.wanted, ...this.tans, this.finger, this.ink);
     svg.append(this.table);
     this.put(tray(tokens));
   }
@@ -128,7 +129,7 @@ export class Board {
   }
 
   // The tans at a share of a move's time.
-  between({ frames, token, lifts }, share) {
+  between({ frames, token, lifts, finger }, share) {
     const eased = lifts ? share * share * (3 - 2 * share) : share;
     const at = eased * (frames.length - 1);
     const first = Math.max(0, Math.min(Math.floor(at), frames.length - 2));
@@ -139,6 +140,9 @@ export class Board {
       const [tx, ty, turned] = there[k];
       return [x + part * (tx - x), y + part * (ty - y), angle + part * wrapped(turned - angle)];
     });
+    const tip = share < 1 && finger?.[Math.round(at)];
+    this.finger.style.display = tip ? "inline" : "none";
+    if (tip) ["cx", "cy"].forEach((name, i) => this.finger.setAttribute(name, tip[i]));
     this.draw(token ?? -1, lifts && share < 1 ? Math.sin(Math.PI * share) : 0);
   }
 
@@ -147,6 +151,7 @@ export class Board {
     this.move = null;
     this.idle = 0;
     this.tans.forEach((tan) => tan.classList.remove("blocked"));
+    this.finger.style.display = "none";
     this.draw();
   }
 

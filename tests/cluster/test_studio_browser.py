@@ -187,7 +187,7 @@ def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
 
 @pytest.mark.check
 def test_tans_are_pushed_too_and_the_agent_fills_alone(page: Page) -> None:
-    page.locator("#motion").select_option("slide")
+    page.locator("#motion").select_option("push")
     page.locator("#who").select_option("agent")
     page.locator("[data-figure=cat]").click()
     expect(page.locator("#told")).to_contain_text("agent alone")
@@ -512,7 +512,7 @@ def test_what_is_laid_goes_on_while_another_way_is_looked_at(page: Page) -> None
     moving(page)
     source(page, "file")
     source(page, "library")
-    page.locator("#motion").select_option("slide")  # at once, from where they lie
+    page.locator("#motion").select_option("push")  # at once, from where they lie
     moving(page)
     page.locator("#motion").select_option("lift")
     status(page).to_have_text(LAID)

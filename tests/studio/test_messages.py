@@ -22,7 +22,7 @@ SAVE = {"ask": "save", "kind": "gif", "tokens": TOKENS}
         (FILL | {"puzzle": "cat"}, Fill),
         (FILL | {"outlines": [RING], "free": True, "who": "agent"}, Fill),
         (FILL | {"pieces": TOKENS}, Fill),
-        (PLAY | {"start": TOKENS, "motion": "slide"}, Play),
+        (PLAY | {"start": TOKENS, "motion": "push"}, Play),
         ({"ask": "next"}, Next),
         (SAVE | {"name": "cat"}, Save),
     ],

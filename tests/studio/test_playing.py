@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from shapely.geometry import Point, Polygon
 
 from tangram_sim.puzzles.figures import load_puzzle
 from tangram_sim.targets.targets import placement, turned_figure
@@ -13,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 def figure(name: str) -> Sides:
-    layout = player("lift").layout
+    layout = player().layout
     poses, flipped = placement(load_puzzle(name), layout)
     return Sides(turned_figure(layout, (poses, flipped), 0.0), flipped)
 
@@ -33,7 +34,7 @@ def laid(scene: Sides, goal: Sides, motion: str, most: int = 40) -> list[Move]:
 @pytest.mark.parametrize("name", ["cat", "swan", "rabbit"])
 def test_every_token_is_carried_to_its_piece_once(name: str) -> None:
     goal = figure(name)
-    *moves, end = laid(Sides(begin(goal, "lift", 3), goal.flipped), goal, "lift")
+    *moves, end = laid(Sides(begin(goal, 3), goal.flipped), goal, "lift")
     assert sorted(move.token for move in moves if move.token is not None) == list(range(7))
     assert end.iou > 0.99
     assert [len(move.frames) for move in moves] == [2] * 7
@@ -50,34 +51,33 @@ def test_nothing_is_moved_where_all_lie() -> None:
 
 def test_starts_lie_beside_the_figure_and_another_seed_is_another_start() -> None:
     goal = figure("cat")
-    first, again, other = (begin(goal, "lift", seed) for seed in (1, 1, 2))
+    first, again, other = (begin(goal, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0.1
     move = next_move(Sides(first, goal.flipped), goal, "lift", None)
     assert move.coverage < 0.3
 
 
-def test_a_push_is_shown_in_parts_and_moves_what_is_in_its_way() -> None:
-    goal = figure("cat")
-    scene, done, parts = Sides(begin(goal, "slide", 0), goal.flipped), None, set[int]()
-    others = 0
-    for _ in range(12):
-        move = next_move(scene, goal, "slide", done)
-        assert isinstance(move.done, Round)
+@pytest.mark.parametrize("name", ["cat", "swan"])  # the swan's parallelogram lies on its other side
+def test_a_push_is_shown_in_parts_with_the_finger_beside_its_token(name: str) -> None:
+    goal, layout = figure(name), player().layout
+    scene, done = Sides(begin(goal, 0), goal.flipped), None
+    for number in range(5):
+        move = next_move(scene, goal, "push", done)
         assert move.token is not None
-        parts.add(len(move.frames))
-        moved = np.abs(move.frames[-1] - move.frames[0]).max(axis=1) > 1e-3
-        assert moved[move.token]
-        others += moved.sum() - 1
+        assert move.finger is not None
+        assert (len(move.frames), len(move.finger)) == (PARTS + 1, PARTS + 1)
+        assert np.abs(move.frames[-1] - move.frames[0])[move.token].max() > 1e-3
+        corners = layout.corners(scene.poses, scene.flipped)[layout.corners_of(move.token)]
+        assert Polygon(corners).distance(Point(move.finger[0])) == pytest.approx(0.045, abs=1e-3)
         scene, done = Sides(move.frames[-1], scene.flipped), move.done
-    assert parts == {PARTS + 1}
-    assert others > 0
-    assert len(move.done.actions) == 12
+        assert len(done.actions) == number + 1
 
 
-def test_a_pushed_token_has_as_many_actions_as_the_agent_has() -> None:
-    goal = figure("swan")
-    moves = laid(Sides(begin(goal, "slide", 1), goal.flipped), goal, "slide")
-    tokens = [move.token for move in moves if move.token is not None]
-    allowed = player("slide").run.task.sim.actions_per_token
-    assert max(np.bincount(tokens)) <= allowed
+def test_pushing_ends_after_as_many_pushes_as_an_episode_has() -> None:
+    goal = figure("cat")
+    scene = Sides(begin(goal, 1), goal.flipped)
+    used = Round(np.zeros((0, 23, 2), np.float32), np.zeros((56, 4), np.float32))
+    assert not next_move(scene, goal, "push", None).ended
+    assert next_move(scene, goal, "push", used).ended
+    assert next_move(goal, goal, "push", None).ended  # all lie

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("name", ["cat", "swan"])
 def test_a_puzzle_file_and_an_svg_have_the_tokens_where_they_lie(name: str, tmp_path: Path) -> None:
-    goal, layout = figure(name), player("lift").layout
+    goal, layout = figure(name), player().layout
     (puzzle,) = parse_puzzles(puzzle_file(goal, "mine").decode(), "saved", PuzzleRules(0.6))
     poses, flipped = placement(puzzle, layout)
     assert puzzle.name == "mine"
@@ -55,7 +55,7 @@ def test_a_name_that_no_reader_takes_is_refused(name: str) -> None:
 
 def test_a_gif_has_all_moves_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     goal = figure("cat")
-    scene = Sides(begin(goal, "lift", 0), goal.flipped)
+    scene = Sides(begin(goal, 0), goal.flipped)
     first = next_move(scene, goal, "lift", None)
     second = next_move(Sides(first.frames[-1], scene.flipped), goal, "lift", first.done)
     with Image.open(BytesIO(gif([first, second], goal))) as film:
