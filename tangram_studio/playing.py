@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from tangram_agent.runs import Run, load_changed, load_run
-from tangram_core.arrays import Bools, Floats, Singles
-from tangram_core.task import History
+from tangram_core.arrays import Bools, Floats
 from tangram_sim.batch import BatchedEnv, Starts
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.overlap import overlap_share
@@ -29,7 +28,6 @@ from tangram_tasks.pairing import paired
 from tangram_tasks.push.env import PushEnv
 from tangram_tasks.push.places import push_of
 from tangram_tasks.push.task import Push
-from worker.play.rollout import greedy
 
 AGENT, FINGER = "pretrained/tangram7", "pretrained/hand"
 PARTS = 20  # of a push, as it is shown
@@ -46,19 +44,6 @@ class Sides(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Round:
-    """What was done since the tokens had all their actions: the agent may use each of them again.
-
-    Attributes:
-        corners: (T, V, 2) of the tokens before each action.
-        actions: (T, A).
-    """
-
-    corners: Singles
-    actions: Singles
-
-
-@dataclass(frozen=True, eq=False)
 class Move:
     """What one move came to.
 
@@ -69,7 +54,7 @@ class Move:
         blocked: the token could not be set down on others, and lies where it was.
         coverage: share of the figure that is covered after it.
         iou: area that tokens and figure share over the area of both together.
-        done: the round until now.
+        done: tokens that were moved in this round, this one among them.
         ended: no token has an action left in this round.
     """
 
@@ -78,7 +63,7 @@ class Move:
     blocked: bool
     coverage: float
     iou: float
-    done: Round
+    done: tuple[int, ...]
     ended: bool
     finger: Floats | None = None
 
@@ -92,7 +77,6 @@ class _Player:
         self.layout = self.run.task.layout
         sim = replace(self.run.task.sim.blind, starts="outside")
         self.env = BatchedEnv(self.layout, sim, RewardConfig(), 1)
-        self.choose = greedy(self.run.actor)
 
 
 class _Finger:
@@ -108,8 +92,8 @@ class _Finger:
         self._table = PushTable(self._task.layout, self._task.config.finger)
         self.most = self._task.spec.horizon
 
-    def push(self, scene: Sides, goal: Sides) -> tuple[Singles, int, Floats, Floats] | None:
-        """A push (1, 4), its token, frames (F, K, 3), and the finger's places (F, 2).
+    def push(self, scene: Sides, goal: Sides) -> tuple[int, Floats, Floats] | None:
+        """Which token, frames (F, K, 3), and the finger's places (F, 2).
 
         None where all lie in their places, or the finger cannot come down.
 
@@ -134,7 +118,7 @@ class _Finger:
             frames[at:] = self._table.poses()
         if image:
             frames, path = layout.mirrored(frames, scene.flipped)[0], path * (1.0, -1.0)
-        return action, int(chosen_tokens(action.astype(np.float64), layout.tokens)[0]), frames, path
+        return int(chosen_tokens(action.astype(np.float64), layout.tokens)[0]), frames, path
 
 
 @lru_cache(maxsize=1)
@@ -161,61 +145,49 @@ def begin(goal: Sides, seed: int) -> Floats:
     return poses
 
 
-def _nothing_done() -> Round:
-    env = player().env
-    corners = np.zeros((0, env.layout.corner_count, 2), np.float32)
-    return Round(corners, np.zeros((0, env.action_size), np.float32))
-
-
-def next_move(scene: Sides, goal: Sides, motion: str, done: Round | None) -> Move:
+def next_move(scene: Sides, goal: Sides, motion: str, done: tuple[int, ...]) -> Move:
     """The next move.
 
     Args:
         scene: the tokens as they lie.
         goal: the figure.
         motion: carried or pushed.
-        done: the round until now; None: nothing yet.
+        done: tokens that were moved in this round: each is carried once in it, and pushed until
+            the round has as many pushes as an episode.
     """
-    done = _nothing_done() if done is None else done
-    if motion == "push":
-        return _next_push(scene, goal, done)
+    return (_push if motion == "push" else _carry)(scene, goal, done)
+
+
+def _carry(scene: Sides, goal: Sides, done: tuple[int, ...]) -> Move:
     own = player()
     env, layout = own.env, own.layout
-    used = np.bincount(
-        chosen_tokens(done.actions.astype(np.float64), layout.tokens), minlength=layout.tokens
-    )
-    placed = (used >= env.sim.actions_per_token) | _placed(scene, goal)
+    placed = _placed(scene, goal)
+    placed[[*done]] = True
     starts = Starts(scene.poses[None], scene.flipped[None], placed[None])
     targets = goal.poses[None], goal.flipped[None]
     env.reset([np.random.default_rng(0)], targets, starts=starts)
     token, blocked, frames = None, False, scene.poses[None]
     if not placed.all():
         before = layout.poses(env.corners)[0]
-        here = env.corners.astype(np.float32)
-        corners = np.concatenate([done.corners, here])[None]
-        past = History({"corners": corners}, done.actions[None])
         seen = {"corners": env.seen, "placed": env.closed, "goals": env.seen_goals}
-        actions = own.choose(seen, past, [])
-        result = env.step(actions.astype(np.float64))
-        done = Round(np.concatenate([done.corners, here]), np.concatenate([done.actions, actions]))
+        result = env.step(own.run.act(seen).astype(np.float64))
+        tried = int(result.tokens[0])
+        done = (*done, tried)
         after = layout.poses(env.corners)[0]
         if result.blocked[0] or np.abs(after - before).max() > _STILL:
-            token, blocked = int(result.tokens[0]), bool(result.blocked[0])
-            frames = np.stack([before, after])
-    after = _scores(Sides(frames[-1], scene.flipped), goal)
-    return Move(token, frames, blocked, *after, done, bool(placed.all()))
+            token, blocked, frames = tried, bool(result.blocked[0]), np.stack([before, after])
+    scores = _scores(Sides(frames[-1], scene.flipped), goal)
+    return Move(token, frames, blocked, *scores, done, bool(placed.all()))
 
 
-def _next_push(scene: Sides, goal: Sides, done: Round) -> Move:
-    """The next push; a round has as many as an episode."""
+def _push(scene: Sides, goal: Sides, done: tuple[int, ...]) -> Move:
     own = finger()
-    found = own.push(scene, goal) if len(done.actions) < own.most else None
+    found = own.push(scene, goal) if len(done) < own.most else None
     if found is None:
         return Move(None, scene.poses[None], False, *_scores(scene, goal), done, ended=True)
-    action, token, frames, path = found
-    done = Round(done.corners, np.concatenate([done.actions.reshape(-1, 4), action]))
-    after = _scores(Sides(frames[-1], scene.flipped), goal)
-    return Move(token, frames, False, *after, done, ended=False, finger=path)
+    token, frames, path = found
+    scores = _scores(Sides(frames[-1], scene.flipped), goal)
+    return Move(token, frames, False, *scores, (*done, token), ended=False, finger=path)
 
 
 def _scores(scene: Sides, goal: Sides) -> tuple[float, float]:

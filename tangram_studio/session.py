@@ -13,7 +13,7 @@ from tangram_studio import filling, playing, saving
 from tangram_studio.filling import Answer
 from tangram_studio.jobs import Jobs
 from tangram_studio.messages import Fill, Next, Play, Save, read, write
-from tangram_studio.playing import Move, Round, Sides
+from tangram_studio.playing import Move, Sides
 
 ROUNDS = 5  # of a figure that is not laid yet: an agent that gets nowhere ends, too
 LAID = 0.95  # IoU from which a figure counts as laid
@@ -31,7 +31,7 @@ class Game:
         goal: the figure.
         motion: whether tokens are carried, or pushed by a finger.
         scene: the tokens as they lie.
-        done: the round until now; None: nothing yet.
+        done: tokens that were moved in this round.
         rounds: before it.
         moved: whether anything was moved in it.
     """
@@ -39,7 +39,7 @@ class Game:
     goal: Sides
     motion: str
     scene: Sides
-    done: Round | None = None
+    done: tuple[int, ...] = ()
     rounds: int = 0
     moved: bool = False
 
@@ -50,7 +50,7 @@ class Game:
             return True
         if move.iou >= LAID or not self.moved or self.rounds + 1 >= ROUNDS:
             return False
-        self.done, self.rounds, self.moved = None, self.rounds + 1, False
+        self.done, self.rounds, self.moved = (), self.rounds + 1, False
         return True
 
 

@@ -8,7 +8,7 @@ from shapely.geometry import Point, Polygon
 
 from tangram_sim.puzzles.figures import load_puzzle
 from tangram_sim.targets.targets import placement, turned_figure
-from tangram_studio.playing import PARTS, Move, Round, Sides, begin, next_move, player
+from tangram_studio.playing import PARTS, Move, Sides, begin, next_move, player
 
 pytestmark = pytest.mark.slow
 
@@ -20,7 +20,7 @@ def figure(name: str) -> Sides:
 
 
 def laid(scene: Sides, goal: Sides, motion: str, most: int = 40) -> list[Move]:
-    moves, done = list[Move](), None
+    moves, done = list[Move](), ()
     for _ in range(most):
         move = next_move(scene, goal, motion, done)
         moves.append(move)
@@ -54,14 +54,14 @@ def test_starts_lie_beside_the_figure_and_another_seed_is_another_start() -> Non
     first, again, other = (begin(goal, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0.1
-    move = next_move(Sides(first, goal.flipped), goal, "lift", None)
+    move = next_move(Sides(first, goal.flipped), goal, "lift", ())
     assert move.coverage < 0.3
 
 
 @pytest.mark.parametrize("name", ["cat", "swan"])  # the swan's parallelogram lies on its other side
 def test_a_push_is_shown_in_parts_with_the_finger_beside_its_token(name: str) -> None:
     goal, layout = figure(name), player().layout
-    scene, done = Sides(begin(goal, 0), goal.flipped), None
+    scene, done = Sides(begin(goal, 0), goal.flipped), ()
     for number in range(5):
         move = next_move(scene, goal, "push", done)
         assert move.token is not None
@@ -71,13 +71,12 @@ def test_a_push_is_shown_in_parts_with_the_finger_beside_its_token(name: str) ->
         corners = layout.corners(scene.poses, scene.flipped)[layout.corners_of(move.token)]
         assert Polygon(corners).distance(Point(move.finger[0])) == pytest.approx(0.045, abs=1e-3)
         scene, done = Sides(move.frames[-1], scene.flipped), move.done
-        assert len(done.actions) == number + 1
+        assert len(done) == number + 1
 
 
 def test_pushing_ends_after_as_many_pushes_as_an_episode_has() -> None:
     goal = figure("cat")
     scene = Sides(begin(goal, 1), goal.flipped)
-    used = Round(np.zeros((0, 23, 2), np.float32), np.zeros((56, 4), np.float32))
-    assert not next_move(scene, goal, "push", None).ended
-    assert next_move(scene, goal, "push", used).ended
-    assert next_move(goal, goal, "push", None).ended  # all lie
+    assert not next_move(scene, goal, "push", ()).ended
+    assert next_move(scene, goal, "push", (3,) * 56).ended
+    assert next_move(goal, goal, "push", ()).ended  # all lie

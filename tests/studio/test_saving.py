@@ -56,7 +56,7 @@ def test_a_name_that_no_reader_takes_is_refused(name: str) -> None:
 def test_a_gif_has_all_moves_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     goal = figure("cat")
     scene = Sides(begin(goal, 0), goal.flipped)
-    first = next_move(scene, goal, "lift", None)
+    first = next_move(scene, goal, "lift", ())
     second = next_move(Sides(first.frames[-1], scene.flipped), goal, "lift", first.done)
     with Image.open(BytesIO(gif([first, second], goal))) as film:
         assert film.format == "GIF"
