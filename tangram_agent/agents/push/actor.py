@@ -22,6 +22,7 @@ from tangram_tasks.push.task import Push
 from tangram_tasks.push.trials import Trials, middle
 
 CPU = torch.device("cpu")
+_THEN = 32  # pushes of each token that are looked at after one that is tried out
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
 
 
@@ -94,12 +95,13 @@ class PushActor(NetworkActor):
 
     def _worth(self, scene: Scene) -> torch.Tensor:
         """(n,) of tables: what the pairs of those tokens that are not in place are worth."""
-        count, pairs = self._task.count, self._pairs(scene)
-        drawn, each = torch.arange(PUSHES).expand(pairs[0].numel(), -1), pairs.reshape(2, -1, 1)
-        value = self._best(scene.repeated(count), each, drawn, self._config.looked_at)[0]
-        left, least = scene.present & ~self._tokens.placed(scene), -1.0 / (1.0 - self._config.gamma)
-        worth = value.view(-1, count).clamp(least, -0.5)  # one more push at least
-        return (left * worth).sum(1)
+        rows, slots = (scene.present & ~self._tokens.placed(scene)).nonzero(as_tuple=True)
+        some, drawn = scene.only(rows), torch.arange(PUSHES).expand(len(rows), -1)
+        pairs = torch.stack([slots, beside(some, slots)])[..., None]
+        value = self._best(some, pairs, drawn, _THEN)[0][:, 0]
+        least = -1.0 / (1.0 - self._config.gamma)
+        worth = value.clamp(least, -0.5)  # one more push at least
+        return torch.zeros(len(scene.poses)).index_add(0, rows, worth)
 
     def _pairs(self, scene: Scene) -> torch.Tensor:
         """(2, n, K) all tokens, and those beside them."""

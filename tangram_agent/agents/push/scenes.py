@@ -38,6 +38,10 @@ class Scene:
         """Every row so many times."""
         return Scene(*(one.repeat_interleave(count, 0) for one in vars(self).values()))
 
+    def only(self, rows: Tensor) -> "Scene":
+        """These rows."""
+        return Scene(*(one[rows] for one in vars(self).values()))
+
 
 class Tokens:
     """What is the same on all tables.
