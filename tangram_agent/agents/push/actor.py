@@ -23,6 +23,7 @@ from tangram_tasks.push.trials import Trials, middle
 
 CPU = torch.device("cpu")
 _THEN = 32  # pushes of each token that are looked at after one that is tried out
+_OTHERS = 101  # pushes by which the drawn ones move on from one decision to the next
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
 
 
@@ -44,7 +45,7 @@ class PushActor(NetworkActor):
         super().__init__(Played(task, config.width))
         self._task, self._config, self._tokens = task, config, Tokens(task, CPU)
 
-    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
+    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:
         """(B, 4) of corners and goals (B, V, 2).
 
         Where it explores, other pushes are drawn each time, and some are any.
@@ -53,6 +54,7 @@ class PushActor(NetworkActor):
         corners, goals = seen["corners"], seen["goals"]
         scene = tokens.scene(corners, goals)
         drawn, any_push = self._drawn(len(corners), explore)
+        drawn = drawn.roll(_OTHERS * past.actions.shape[1], 1)  # what led nowhere is not all again
         times = 1 if explore is not None else _SURE
         most = max(1, tried) if explore is None else 1
         pairs, looked_at = self._pairs(scene), times * self._config.looked_at
@@ -85,13 +87,16 @@ class PushActor(NetworkActor):
         """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine."""
         known = middle(self._task)
         after = np.repeat(corners[:, None], actions.shape[1], axis=1)
+        refused = np.zeros(after.shape[:2], np.bool_)
         for table in np.flatnonzero(~self._task.placed(corners, goals).all(axis=1)).tolist():
             self._trials.begin(corners[table], goals[table], known)
             for number, push in enumerate(actions[table]):
                 found = self._trials.after(push)
+                refused[table, number] = found is None
                 after[table, number] = corners[table] if found is None else found
         flat, wanted = after.reshape(-1, *corners.shape[1:]), goals.repeat(actions.shape[1], axis=0)
-        return self._worth(self._tokens.scene(flat, wanted)).view(len(corners), -1).argmax(1)
+        worth = self._worth(self._tokens.scene(flat, wanted)).view(len(corners), -1)
+        return torch.where(torch.from_numpy(refused), -torch.inf, worth).argmax(1)
 
     def _worth(self, scene: Scene) -> torch.Tensor:
         """(n,) of tables: what the pairs of those tokens that are not in place are worth."""
