@@ -23,7 +23,6 @@ from tangram_tasks.push.trials import Trials, middle
 
 CPU = torch.device("cpu")
 _THEN = 32  # pushes of each token that are looked at after one that is tried out
-_OTHERS = 101  # pushes by which the drawn ones move on from one decision to the next
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
 
 
@@ -45,7 +44,7 @@ class PushActor(NetworkActor):
         super().__init__(Played(task, config.width))
         self._task, self._config, self._tokens = task, config, Tokens(task, CPU)
 
-    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:
+    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
         """(B, 4) of corners and goals (B, V, 2).
 
         Where it explores, other pushes are drawn each time, and some are any.
@@ -54,7 +53,6 @@ class PushActor(NetworkActor):
         corners, goals = seen["corners"], seen["goals"]
         scene = tokens.scene(corners, goals)
         drawn, any_push = self._drawn(len(corners), explore)
-        drawn = drawn.roll(_OTHERS * past.actions.shape[1], 1)  # what led nowhere is not all again
         times = 1 if explore is not None else _SURE
         most = max(1, tried) if explore is None else 1
         pairs, looked_at = self._pairs(scene), times * self._config.looked_at

@@ -39,7 +39,7 @@ def best(
         drawn: (n * k, P) numbers of pushes.
         count: of pushes of each token that are looked at: the half after which least is left to go
             if it is alone, and the first that were drawn.
-        most: M.
+        most: M, those that are least worse than the best of the same token.
     """
     _, size, each = pairs.shape
     flat, beside = pairs.flatten(1)
@@ -54,7 +54,13 @@ def best(
     never = never | ~left[one, flat][:, None]
     values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
     most = min(most, values.shape[1])
-    values, at = values.topk(most, dim=1) if most > 1 else values.max(1, keepdim=True)
+    if most > 1:
+        own_best = values.view(size, each, -1).amax(2, keepdim=True).expand(-1, -1, count)
+        less = torch.where(values > _NEVER, values - own_best.reshape(size, -1), _NEVER)
+        at = less.topk(most, dim=1).indices
+        values = values.gather(1, at)
+    else:
+        values, at = values.max(1, keepdim=True)
     slot, push = at // count, at % count
     row = torch.arange(size, device=drawn.device)[:, None] * each + slot
     rows = row.flatten()

@@ -233,6 +233,19 @@ def test_a_push_that_is_tried_in_the_engine_is_known_to_lead_home() -> None:
     assert actor._tried(corners, goals, actions).tolist() == place
 
 
+def test_pushes_of_every_token_that_is_not_in_place_are_tried() -> None:
+    actor = Pushing(SMALL).actor(SOME)
+    assert isinstance(actor, PushActor)
+    actor.load(Pushing(SMALL).learner(SOME, 0, "cpu").broadcast())
+    found = scene(SOME, 5)
+    goals = found.goals.clone()
+    goals[:, 1] = found.poses[:, 1]
+    found = replace(found, goals=goals)
+    drawn = torch.arange(PUSHES).expand(15, -1)
+    _, slots, _ = actor._best(found, actor._pairs(found), drawn, 40, most=12)
+    assert all(set(row) == {0, 2} for row in slots.tolist())
+
+
 def test_no_more_pushes_are_tried_than_there_are() -> None:
     actor = Pushing(replace(SMALL, tried=1000)).actor(SQUARE)
     with closing(SQUARE.make(1)) as env:
