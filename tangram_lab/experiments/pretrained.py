@@ -38,7 +38,7 @@ FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of ea
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
 # What an agent looks ahead by as it ships, and does not in training.
 AHEAD = {"outline": {"beam": 12}, "push": {"tried": 16}}
-DEAR = ("planner", "planner_told", "planner_wrong")  # rivals that would take hours
+DEAR = ("table", "planner", "planner_told", "planner_wrong")  # rivals that would take hours
 
 
 class Candidate(NamedTuple):

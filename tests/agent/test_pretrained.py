@@ -117,8 +117,10 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
     folder = pretrained.PACKAGED / name
     run = load_run(f"pretrained/{name}")
     card = json.loads((folder / CARD).read_bytes())
-    assert [shape.name for shape in run.task.layout.shapes] == card["task"]["tokens"]
-    assert card["tests"]["scores"]["this run"]["mean_reward"] > 0.9  # as it ships
+    layout = run.setup.task.layout  # type: ignore[attr-defined]
+    assert [shape.name for shape in layout.shapes] == card["task"]["tokens"]
+    scores = card["tests"]["scores"]["this run"]  # as it ships
+    assert scores["placed"] > 0.6 if name == "hand" else scores["mean_reward"] > 0.9
     assert len((folder / WEIGHTS).read_bytes()) < 1_000_000
     assert f"# pretrained/{name}\n" in (folder / "card.md").read_text()
 

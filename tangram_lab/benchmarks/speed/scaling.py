@@ -33,7 +33,9 @@ ENDLESS = ("max_updates=0", "service.checkpoint_minutes=60", "service.http_port=
 # Play is slow, learning is next to nothing, and the evaluator rests.
 PLAYING = (
     *ENDLESS,
-    "sim.pixels=64",
+    "task=push",
+    "tokens=tangram7",
+    "task.count=2",
     "agent.updates_per_transition=0.001",
     "service.eval_seconds=3600",
     "service.eval_episodes=1",
@@ -122,7 +124,7 @@ def _real(runs: int, folder: Path) -> Iterator[Row]:
         )
         found = [[run.rates("episodes")["episodes"] for run in (both, alone)] for _ in range(runs)]
     two, one = zip(*found, strict=True)
-    yield compared((STAGE, "2 workers, camera", "episodes/s"), two, "1 worker", one)
+    yield compared((STAGE, "2 workers, a finger", "episodes/s"), two, "1 worker", one)
     shares = [ours / theirs / 2.0 for ours, theirs in found]
     bound = LINEAR if len(os.sched_getaffinity(0)) >= CORES else None
     yield single((STAGE, "2 workers, efficiency", "of twice 1 worker"), shares, bound)
