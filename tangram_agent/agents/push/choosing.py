@@ -52,10 +52,10 @@ def best(
     one = torch.arange(size, device=drawn.device).repeat_interleave(each)
     left = scene.present & ~tokens.placed(scene)
     never = never | ~left[one, flat][:, None]
-    values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, -1)
+    values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, each * count)
     most = min(most, values.shape[1])
     if most > 1:
-        own_best = values.view(size, each, -1).amax(2, keepdim=True).expand(-1, -1, count)
+        own_best = values.view(size, each, count).amax(2, keepdim=True).expand(-1, -1, count)
         less = torch.where(values > _NEVER, values - own_best.reshape(size, -1), _NEVER)
         at = less.topk(most, dim=1).indices
         values = values.gather(1, at)
@@ -64,7 +64,7 @@ def best(
     slot, push = at // count, at % count
     row = torch.arange(size, device=drawn.device)[:, None] * each + slot
     rows = row.flatten()
-    other = critics.one(1, _only(seen, rows), numbers[row, push].view(len(rows), 1, -1))
+    other = critics.one(1, _only(seen, rows), numbers[row, push].flatten(0, 1)[:, None])
     return torch.minimum(values, other.view_as(values)), pairs[0].gather(1, slot), which[row, push]
 
 

@@ -246,6 +246,13 @@ def test_pushes_of_every_token_that_is_not_in_place_are_tried() -> None:
     assert all(set(row) == {0, 2} for row in slots.tolist())
 
 
+def test_where_all_is_in_place_nothing_is_left_to_go() -> None:
+    actor, found = Pushing(SMALL).actor(SOME), scene(SOME, 3)
+    assert isinstance(actor, PushActor)
+    assert actor._worth(replace(found, goals=found.poses)).tolist() == [0.0, 0.0, 0.0]
+    assert (actor._worth(found) < 0.0).all()
+
+
 def test_no_more_pushes_are_tried_than_there_are() -> None:
     actor = Pushing(replace(SMALL, tried=1000)).actor(SQUARE)
     with closing(SQUARE.make(1)) as env:
