@@ -1,8 +1,7 @@
 """What networks see of tokens and of pushes, in the frame of the token that is pushed.
 
-They see one other token beside it, the one that matters most. Of all others they see how near a
-push comes to them, and on which sides they close its place. So what is learned of two tokens holds
-for seven.
+They see one other token beside it, the one that matters most, and of all the others only how near
+a push comes to them. So what they learn of two tokens holds for seven.
 
 Legend: n rows, each with a token that may be pushed; K tokens of a row, C corners, N pushes.
 """
@@ -30,8 +29,8 @@ _EDGE = 0.3  # so are distances from the table's edge
 
 
 def token_numbers(corners: int) -> int:
-    """Of the token that is pushed: its way, its outline, the table's edge, its place's sides."""
-    return LEFT + 2 * corners + 1 + 4 * corners
+    """Of the token that is pushed: its way, its outline, its distance from the table's edge."""
+    return LEFT + 2 * corners + 1
 
 
 def other_numbers(corners: int) -> int:
@@ -81,6 +80,7 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor, others: Tensor) -> Seen
     rows, count = torch.arange(len(slots), device=slots.device), scene.poses.shape[1]
     left = tokens.left(scene.poses, scene.goals, scene.which)
     pose, which, own = scene.poses[rows, slots], scene.which[rows, slots], left[rows, slots]
+    token = [ways(tokens, own), tokens.outlines[which].flatten(1) * _LARGE, edge(pose[:, :2])]
     x, y, cos, sin = *pose[:, :2].T, pose[:, 2].cos(), pose[:, 2].sin()
 
     def here(points: Tensor) -> Tensor:  # (..., n, 2) in the token's frame, of (2, ..., n)
@@ -106,32 +106,8 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor, others: Tensor) -> Seen
     each = (slots[:, None] + torch.arange(1, count, device=slots.device)) % count
     every = rows[:, None], each
     outlines = tokens.laid(scene.poses[every], scene.which[every])
-    placed = tokens.near(left[every])
-    token = [
-        ways(tokens, own),
-        tokens.outlines[which].flatten(1) * _LARGE,
-        edge(pose[:, :2]),
-        sides(tokens, tokens.laid(scene.goals[rows, slots], which), outlines, placed),
-    ]
     seen = torch.cat(token, dim=-1), torch.cat(other, dim=-1), there
-    return Seen(*seen, pose, own, which, outlines, placed)
-
-
-def sides(tokens: Tokens, place: Tensor, outlines: Tensor, placed: Tensor) -> Tensor:
-    """(n, 4C) how open a place (2, C, n) is: 1 where a finger has room, 0 where a token lies.
-
-    At two points of each edge, of others in their places (n, K - 1) first, and then of the rest.
-    """
-    edges = place.roll(-1, 1) - place
-    length = edges.norm(dim=0)
-    out = torch.stack([edges[1], -edges[0]]) / length.clamp_min(1e-6) * tokens.finger
-    points = torch.cat([place + share * edges + out for share in (0.25, 0.75)], dim=1)
-    if not placed.shape[1]:
-        return torch.ones_like(points).flatten(0, 1).T
-    far = distance(outlines[:, :, :, None], points.movedim(1, 2)[..., None])
-    short = torch.cat([length, length], dim=0).T < 1e-6  # corners of small tokens repeat
-    far = torch.where(short[..., None], _NEAR, far)
-    return torch.cat([_least(far, some) for some in (placed, ~placed)], dim=-1)
+    return Seen(*seen, pose, own, which, outlines, tokens.near(left[every]))
 
 
 def ways(tokens: Tokens, left: Tensor) -> Tensor:
@@ -180,14 +156,9 @@ def pushes(
         gap(tokens.laid(placed_at(pose, moved), which)[..., None], others),
         gap(tokens.laid(placed_at(pose, moved / 2.0), which)[..., None], others),
     ]
-    room = torch.stack(near, dim=2)
-    # To hit a token in its place is worse.
-    parts += [_least(room, some[:, None]) for some in (seen.placed, ~seen.placed)]
+    room = torch.stack(near)
+    for some in (seen.placed, ~seen.placed):  # to hit a token in its place is worse
+        least = torch.where(some[:, None], room, _NEAR).amin(-1).movedim(0, -1)
+        parts.append(least.clamp(-_NEAR, _NEAR) / _NEAR)
     blocked = distance(others, first).amin(-1) < tokens.finger
     return torch.cat(parts, dim=-1), beyond | blocked
-
-
-def _least(room: Tensor, some: Tensor) -> Tensor:
-    """(n, ..., P) the least of room (n, ..., P, K - 1) to some (n, ..., K - 1) of the others."""
-    least = torch.where(some[..., None, :], room, _NEAR).amin(-1)
-    return least.clamp(-_NEAR, _NEAR) / _NEAR
