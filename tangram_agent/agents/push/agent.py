@@ -76,4 +76,4 @@ class Pushing(Agent):
 
     def facts(self) -> Json:
         """Its name, and that of its network."""
-        return {"agent": "push", "net": f"sums of {self.config.width}"}
+        return {"agent": "push", "net": f"pairs, {self.config.width} wide"}
