@@ -193,6 +193,7 @@ def test_tans_are_pushed_too_and_the_agent_fills_alone(page: Page) -> None:
     expect(page.locator("#told")).to_contain_text("agent alone")
     moving(page)
     assert page.evaluate("studio.board.move.frames.length") == 21
+    expect(page.locator(".finger")).to_be_visible()
     after(page, 6)
     shot(page, "pushed")
     status(page).to_have_text(re.compile("^(Laid|It can do no more): covers"))

@@ -15,7 +15,7 @@ from tangram_agent.agents.push.networks import Table, Twins
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens
 from tangram_agent.agents.push.seen import beside
 from tangram_agent.base.acting import NetworkActor
-from tangram_core.arrays import Floats, Ints, Singles
+from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
 from tangram_tasks.push.task import Push
@@ -99,9 +99,9 @@ class PushActor(NetworkActor):
     def _worth(self, scene: Scene) -> torch.Tensor:
         """(n,) of tables: what the pairs of those tokens that are not in place are worth."""
         rows, slots = (scene.present & ~self._tokens.placed(scene)).nonzero(as_tuple=True)
-        some, drawn = scene.only(rows), torch.arange(PUSHES).expand(len(rows), -1)
+        some = scene.only(rows)
         pairs = torch.stack([slots, beside(some, slots)])[..., None]
-        value = self._best(some, pairs, drawn, _THEN)[0][:, 0]
+        value = self._best(some, pairs, _all_pushes(len(rows)), _THEN)[0][:, 0]
         least = -1.0 / (1.0 - self._config.gamma)
         worth = value.clamp(least, -0.5)  # one more push at least
         return torch.zeros(len(scene.poses)).index_add(0, rows, worth)
@@ -121,9 +121,13 @@ class PushActor(NetworkActor):
         """(B * K, P) pushes to look at, and three numbers (B, 3) in [0, 1) for each environment."""
         each = self._task.count
         if explore is None:  # all of them, always in the same order
-            whole: Ints = np.tile(np.arange(PUSHES), (count * each, 1))
-            return torch.from_numpy(whole), np.ones((count, 3), np.float32)
+            return _all_pushes(count * each), np.ones((count, 3), np.float32)
         size = (each, 2 * self._config.looked_at)
         drawn = [(one.integers(PUSHES, size=size), one.random(3)) for one in explore]
         pushes, numbers = (np.stack(part) for part in zip(*drawn, strict=True))
         return torch.from_numpy(pushes.reshape(count * each, -1)), numbers.astype(np.float32)
+
+
+def _all_pushes(rows: int) -> torch.Tensor:
+    """(rows, 1024), always in the same order."""
+    return torch.arange(PUSHES).expand(rows, -1)

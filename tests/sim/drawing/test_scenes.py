@@ -169,3 +169,12 @@ def test_captions_tell_name_and_share() -> None:
     ends = np.stack([GOAL, PAIR.corners(np.array([[0.2, -0.5, 0.0], [0.2, -0.5, 0.0]]))])
     told = captions(PAIR, ends, np.stack([GOAL, GOAL]), ["cat", "dog"])
     assert told == ["cat   100.0 %", "dog   50.0 %"]
+
+
+def test_the_finger_is_drawn_where_it_is() -> None:
+    places = [(0.6, -0.6), (-0.6, 0.6)]
+    for x, y in places:
+        shown = game(held=Held(0, finger=np.array([x, y])))
+        assert [sum(at(shown, *place)) < 200 for place in places] == [
+            place == (x, y) for place in places
+        ]

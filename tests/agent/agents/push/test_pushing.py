@@ -222,6 +222,25 @@ def test_pushes_of_every_token_that_is_not_in_place_are_tried() -> None:
     assert all(set(row) == {0, 2} for row in slots.tolist())
 
 
+def test_a_push_that_the_engine_refuses_is_not_the_best_though_it_harms_nothing() -> None:
+    actor, layout = Pushing(SMALL).actor(TWO), TWO.layout
+    assert isinstance(actor, PushActor)
+    corners = layout.corners(np.array([[[0.78, 0.0, 0.0], [-0.4, 0.0, 0.0]]]))
+    goals = layout.corners(np.array([[[0.78, 0.0, 0.0], [-0.4, 0.6, 1.0]]]))
+    trials, rng = Trials(TWO), np.random.default_rng(0)
+    trials.begin(corners[0], goals[0], middle(TWO))
+    refused, harms = list[np.ndarray](), list[np.ndarray]()
+    while not (refused and harms):  # of the square, which is in its place at the table's edge
+        push = np.append(-0.5, rng.uniform(-1.0, 1.0, 3))
+        after = trials.after(push)
+        if after is None:
+            refused.append(push)
+        elif not TWO.placed(after[None], goals)[0, 0]:
+            harms.append(push)
+    actions = np.stack([refused[0], harms[0]])[None]
+    assert actor._tried(corners, goals, actions).tolist() == [1]
+
+
 def test_where_all_is_in_place_nothing_is_left_to_go() -> None:
     actor, found = Pushing(SMALL).actor(SOME), scene(SOME, 3)
     assert isinstance(actor, PushActor)
