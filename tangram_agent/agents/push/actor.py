@@ -12,18 +12,22 @@ from torch import nn
 from tangram_agent.agents.push.agent import PushingConfig
 from tangram_agent.agents.push.choosing import best
 from tangram_agent.agents.push.networks import Table, Twins
-from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens
+from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, gap
 from tangram_agent.agents.push.seen import beside
 from tangram_agent.base.acting import NetworkActor
 from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
+from tangram_tasks.push.order import may_be_laid
 from tangram_tasks.push.task import Push
 from tangram_tasks.push.trials import Trials, middle
 
 CPU = torch.device("cpu")
 _THEN = 32  # pushes of each token that are looked at after one that is tried out
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
+_OVER = 0.02  # depth by which a token lies in the place of another: it must go first
+_SAME = 0.003  # what is nearer has not moved
+_AGAIN = 100.0  # cost of what has been before
 
 
 class Played(nn.Module):
@@ -44,7 +48,7 @@ class PushActor(NetworkActor):
         super().__init__(Played(task, config.width))
         self._task, self._config, self._tokens = task, config, Tokens(task, CPU)
 
-    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
+    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:
         """(B, 4) of corners and goals (B, V, 2).
 
         Where it explores, other pushes are drawn each time, and some are any.
@@ -56,10 +60,12 @@ class PushActor(NetworkActor):
         times = 1 if explore is not None else _SURE
         most = max(1, tried) if explore is None else 1
         pairs, looked_at = self._pairs(scene), times * self._config.looked_at
-        _, slots, found = self._best(scene, pairs, drawn, looked_at, most)
+        allowed = self._allowed(scene, corners, goals)
+        _, slots, found = self._best(scene, pairs, drawn, looked_at, most, allowed)
         which = scene.which.gather(1, slots)
         if most > 1:
-            at = self._tried(corners, goals, tokens.actions[which.numpy(), found.numpy()])[:, None]
+            pushes = tokens.actions[which.numpy(), found.numpy()]
+            at = self._tried(corners, goals, pushes, past)[:, None]
             which, found = which.gather(1, at), found.gather(1, at)
         chosen, pushes = (one[:, 0].numpy().copy() for one in (which, found))
         if explore is not None:
@@ -73,18 +79,38 @@ class PushActor(NetworkActor):
         return actions
 
     def _best(
-        self, scene: Scene, pairs: torch.Tensor, drawn: torch.Tensor, looked_at: int, most: int = 1
+        self,
+        scene: Scene,
+        pairs: torch.Tensor,
+        drawn: torch.Tensor,
+        looked_at: int,
+        most: int = 1,
+        allowed: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, ...]:
         """See `best`."""
         network, count = self.network, min(looked_at, PUSHES)
         with torch.no_grad():
-            moved = network.table.moved
-            return best(network.critic, moved, self._tokens, scene, pairs, drawn, count, most)
+            moved, tokens = network.table.moved, self._tokens
+            return best(network.critic, moved, tokens, scene, pairs, drawn, count, most, allowed)
 
-    def _tried(self, corners: Array, goals: Array, actions: Floats) -> torch.Tensor:
-        """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine."""
-        known = middle(self._task)
-        after = np.repeat(corners[:, None], actions.shape[1], axis=1)
+    def _allowed(self, scene: Scene, corners: Array, goals: Array) -> torch.Tensor:
+        """(B, K) which tokens come next, and those that lie in the places of these."""
+        placed, layout = self._task.placed(corners, goals), self._task.layout
+        rows = [may_be_laid(layout, *row) for row in zip(goals, placed, strict=True)]
+        following = torch.from_numpy(np.stack(rows)).gather(1, scene.which)
+        here = self._tokens.laid(scene.poses, scene.which)[..., :, None]
+        there = self._tokens.laid(scene.goals, scene.which)[..., None, :]
+        over = (gap(here, there) < -_OVER) & ~torch.eye(scene.which.shape[1], dtype=torch.bool)
+        return following | (over & following[:, None]).any(2)
+
+    def _tried(self, corners: Array, goals: Array, actions: Floats, past: History) -> torch.Tensor:
+        """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine.
+
+        What the tokens that it moves are then worth, less what they are now. What has been before
+        is not sought again.
+        """
+        known, each = middle(self._task), actions.shape[1]
+        after = np.repeat(corners[:, None], each, axis=1)
         refused = np.zeros(after.shape[:2], np.bool_)
         for table in np.flatnonzero(~self._task.placed(corners, goals).all(axis=1)).tolist():
             self._trials.begin(corners[table], goals[table], known)
@@ -92,19 +118,26 @@ class PushActor(NetworkActor):
                 found = self._trials.after(push)
                 refused[table, number] = found is None
                 after[table, number] = corners[table] if found is None else found
-        flat, wanted = after.reshape(-1, *corners.shape[1:]), goals.repeat(actions.shape[1], axis=0)
-        worth = self._worth(self._tokens.scene(flat, wanted)).view(len(corners), -1)
-        return torch.where(torch.from_numpy(refused), -torch.inf, worth).argmax(1)
+        flat, wanted = after.reshape(-1, *corners.shape[1:]), goals.repeat(each, axis=0)
+        then, now = self._tokens.scene(flat, wanted), self._tokens.scene(corners, goals)
+        was = self._values(now).repeat_interleave(each, 0)
+        stays = (then.poses - now.repeated(each).poses).abs().amax(-1) < _SAME
+        gained = torch.where(stays, 0.0, self._values(then) - was).sum(1).view(len(corners), -1)
+        way = np.abs(after[:, :, None] - past.seen["corners"][:, None]).max(axis=(3, 4)).min(axis=2)
+        again = torch.from_numpy(way < self._task.config.within / 2.0)
+        gained = torch.where(again, gained - _AGAIN, gained)
+        return torch.where(torch.from_numpy(refused), -torch.inf, gained).argmax(1)
 
-    def _worth(self, scene: Scene) -> torch.Tensor:
-        """(n,) of tables: what the pairs of those tokens that are not in place are worth."""
+    def _values(self, scene: Scene) -> torch.Tensor:
+        """(n, K) of tokens, each with the one beside it; 0 of those in their places."""
         rows, slots = (scene.present & ~self._tokens.placed(scene)).nonzero(as_tuple=True)
         some = scene.only(rows)
         pairs = torch.stack([slots, beside(some, slots)])[..., None]
         value = self._best(some, pairs, _all_pushes(len(rows)), _THEN)[0][:, 0]
         least = -1.0 / (1.0 - self._config.gamma)
-        worth = value.clamp(least, -0.5)  # one more push at least
-        return torch.zeros(len(scene.poses)).index_add(0, rows, worth)
+        found = torch.zeros(scene.present.shape)
+        found[rows, slots] = value.clamp(least, -0.5)  # one more push at least
+        return found
 
     def _pairs(self, scene: Scene) -> torch.Tensor:
         """(2, n, K) all tokens, and those beside them."""

@@ -24,6 +24,7 @@ def best(
     drawn: Tensor,
     count: int,
     most: int = 1,
+    allowed: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The best pushes of each table: their values (n, M), slots of their tokens, and which.
 
@@ -40,6 +41,7 @@ def best(
         count: of pushes of each token that are looked at: the half after which least is left to go
             if it is alone, and the first that were drawn.
         most: M, those that are least worse than the best of the same token.
+        allowed: (n, k) which may be pushed; None: all that are not in their places.
     """
     _, size, each = pairs.shape
     flat, beside = pairs.flatten(1)
@@ -50,8 +52,10 @@ def best(
         tokens, seen, tokens.begins[own, which], tokens.ends[own, which], moved[own, which]
     )
     one = torch.arange(size, device=drawn.device).repeat_interleave(each)
-    left = scene.present & ~tokens.placed(scene)
-    never = never | ~left[one, flat][:, None]
+    left = (scene.present & ~tokens.placed(scene))[one, flat]
+    if allowed is not None:
+        left = left & allowed.flatten()
+    never = never | ~left[:, None]
     values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, each * count)
     most = min(most, values.shape[1])
     if most > 1:
