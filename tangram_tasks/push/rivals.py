@@ -21,6 +21,7 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines_at, shared_area
 from tangram_sim.geometry.shapes import Shape
 from tangram_sim.world.pushing import PushTable, Unknowns
+from tangram_tasks.push.order import come_next
 from tangram_tasks.push.places import apart, on_table, push_of
 from tangram_tasks.push.trials import Trials, middle
 
@@ -149,7 +150,7 @@ class Planner:
         poses, desired = layout.poses(corners), layout.poses(goals)
         present = on_table(goals, layout)
         placed = task.placed(corners[None], goals[None])[0]
-        left = np.flatnonzero(present & ~placed).tolist()
+        left = np.flatnonzero(come_next(layout, corners, goals, placed)).tolist()
         found: list[tuple[float, Floats]] = []
         for token in left:
             error = _error(poses[token], desired[token])

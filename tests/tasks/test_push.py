@@ -19,6 +19,7 @@ from tangram_core.seeding import episode_generator
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
+from tangram_tasks.push.order import come_next
 from tangram_tasks.push.places import AWAY, on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
 from tangram_tasks.push.trials import middle
@@ -309,3 +310,23 @@ def test_what_is_beyond_the_action_space_is_cut() -> None:
         np.testing.assert_array_equal(
             env.step(far)[0]["observation"], other.step(cut)[0]["observation"]
         )
+
+
+def test_the_middle_of_a_row_comes_before_its_second_end() -> None:
+    layout = Push(TokensConfig(("square", "square", "square"), 0.8), PushConfig(count=3)).layout
+    side = float(np.ptp(layout.body[:4, 0]))
+    goals = layout.corners(np.array([[-side, 0.0, 0.0], [0.0, 0.0, 0.0], [side, 0.0, 0.0]]))
+    away = np.array([[-0.7, 0.7, 0.0], [0.0, 0.7, 0.0], [0.7, 0.7, 0.0]])
+    for placed, following in (
+        ([0, 0, 0], [1, 1, 1]),
+        ([1, 0, 0], [0, 1, 0]),
+        ([0, 1, 0], [1, 0, 1]),
+        ([1, 0, 1], [0, 1, 0]),
+        ([1, 1, 1], [0, 0, 0]),
+    ):
+        lies = np.array(placed, np.bool_)
+        found = come_next(layout, layout.corners(away), goals, lies)
+        assert found.astype(int).tolist() == following
+    poses = np.array([[-side, 0.0, 0.0], [0.7, 0.7, 0.0], [side / 2.0, 0.1, 0.0]])
+    found = come_next(layout, layout.corners(poses), goals, np.array([True, False, False]))
+    assert found.tolist() == [False, True, True]  # the last lies in the middle

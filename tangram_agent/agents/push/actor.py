@@ -10,22 +10,21 @@ import torch
 from torch import nn
 
 from tangram_agent.agents.push.agent import PushingConfig
-from tangram_agent.agents.push.choosing import best
+from tangram_agent.agents.push.choosing import Search, best
 from tangram_agent.agents.push.networks import Table, Twins
-from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, gap
+from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens
 from tangram_agent.agents.push.seen import beside
 from tangram_agent.base.acting import NetworkActor
 from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
-from tangram_tasks.push.order import may_be_laid
+from tangram_tasks.push.order import come_next
 from tangram_tasks.push.task import Push
 from tangram_tasks.push.trials import Trials, middle
 
 CPU = torch.device("cpu")
 _THEN = 32  # pushes of each token that are looked at after one that is tried out
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
-_OVER = 0.02  # depth by which a token lies in the place of another: it must go first
 _SAME = 0.003  # what is nearer has not moved
 _AGAIN = 100.0  # cost of what has been before
 
@@ -59,49 +58,36 @@ class PushActor(NetworkActor):
         drawn, any_push = self._drawn(len(corners), explore)
         times = 1 if explore is not None else _SURE
         most = max(1, tried) if explore is None else 1
-        pairs, looked_at = self._pairs(scene), times * self._config.looked_at
-        allowed = self._allowed(scene, corners, goals)
-        _, slots, found = self._best(scene, pairs, drawn, looked_at, most, allowed)
+        count = min(times * self._config.looked_at, PUSHES)
+        search = Search(drawn, count, most, self._next(scene, corners, goals))
+        _, slots, found = self._best(scene, self._pairs(scene), search)
         which = scene.which.gather(1, slots)
         if most > 1:
-            pushes = tokens.actions[which.numpy(), found.numpy()]
-            at = self._tried(corners, goals, pushes, past)[:, None]
+            options = tokens.actions[which.numpy(), found.numpy()]
+            at = self._tried(corners, goals, options, past)[:, None]
             which, found = which.gather(1, at), found.gather(1, at)
         chosen, pushes = (one[:, 0].numpy().copy() for one in (which, found))
         if explore is not None:
             other = any_push[:, 0] < self._config.uniform_share
-            count = scene.present.sum(1).numpy()
-            slot = (any_push[:, 1] * count).astype(np.int64)
+            there = scene.present.sum(1).numpy()
+            slot = (any_push[:, 1] * there).astype(np.int64)
             any_of = scene.which.numpy()[np.arange(len(slot)), slot]
             chosen = np.where(other, any_of, chosen)
             pushes = np.where(other, (any_push[:, 2] * PUSHES).astype(np.int64), pushes)
         actions: Singles = tokens.actions[chosen, pushes].astype(np.float32)
         return actions
 
-    def _best(
-        self,
-        scene: Scene,
-        pairs: torch.Tensor,
-        drawn: torch.Tensor,
-        looked_at: int,
-        most: int = 1,
-        allowed: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, ...]:
+    def _best(self, scene: Scene, pairs: torch.Tensor, search: Search) -> tuple[torch.Tensor, ...]:
         """See `best`."""
-        network, count = self.network, min(looked_at, PUSHES)
         with torch.no_grad():
-            moved, tokens = network.table.moved, self._tokens
-            return best(network.critic, moved, tokens, scene, pairs, drawn, count, most, allowed)
+            network = self.network
+            return best(network.critic, network.table.moved, self._tokens, scene, pairs, search)
 
-    def _allowed(self, scene: Scene, corners: Array, goals: Array) -> torch.Tensor:
-        """(B, K) which tokens come next, and those that lie in the places of these."""
-        placed, layout = self._task.placed(corners, goals), self._task.layout
-        rows = [may_be_laid(layout, *row) for row in zip(goals, placed, strict=True)]
-        following = torch.from_numpy(np.stack(rows)).gather(1, scene.which)
-        here = self._tokens.laid(scene.poses, scene.which)[..., :, None]
-        there = self._tokens.laid(scene.goals, scene.which)[..., None, :]
-        over = (gap(here, there) < -_OVER) & ~torch.eye(scene.which.shape[1], dtype=torch.bool)
-        return following | (over & following[:, None]).any(2)
+    def _next(self, scene: Scene, corners: Array, goals: Array) -> torch.Tensor:
+        """(B, K) which tokens may be pushed."""
+        rows = zip(corners, goals, self._task.placed(corners, goals), strict=True)
+        following = np.stack([come_next(self._task.layout, *row) for row in rows])
+        return torch.from_numpy(following).gather(1, scene.which)
 
     def _tried(self, corners: Array, goals: Array, actions: Floats, past: History) -> torch.Tensor:
         """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine.
@@ -133,7 +119,7 @@ class PushActor(NetworkActor):
         rows, slots = (scene.present & ~self._tokens.placed(scene)).nonzero(as_tuple=True)
         some = scene.only(rows)
         pairs = torch.stack([slots, beside(some, slots)])[..., None]
-        value = self._best(some, pairs, _all_pushes(len(rows)), _THEN)[0][:, 0]
+        value = self._best(some, pairs, Search(_all_pushes(len(rows)), _THEN))[0][:, 0]
         least = -1.0 / (1.0 - self._config.gamma)
         found = torch.zeros(scene.present.shape)
         found[rows, slots] = value.clamp(least, -0.5)  # one more push at least

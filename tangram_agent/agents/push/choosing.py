@@ -3,7 +3,7 @@
 Legend: n tables, K tokens of each, P pushes that are drawn for each token, N that are looked at.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,16 +15,26 @@ from tangram_agent.agents.push.seen import Seen, pushes, seen_by
 _NEVER = -1e3  # value of what cannot be done
 
 
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Which pushes are looked at.
+
+    Attributes:
+        drawn: (n * k, P) numbers of pushes.
+        count: of pushes of each token that are looked at: the half after which least is left to go
+            if it is alone, and the first that were drawn.
+        most: M, those that are least worse than the best of the same token.
+        eligible: (n, k) which tokens are pushed if one can be; None: all not in their places.
+    """
+
+    drawn: Tensor
+    count: int
+    most: int = 1
+    eligible: Tensor | None = None
+
+
 def best(
-    critics: Twins,
-    moved: Tensor,
-    tokens: Tokens,
-    scene: Scene,
-    pairs: Tensor,
-    drawn: Tensor,
-    count: int,
-    most: int = 1,
-    allowed: Tensor | None = None,
+    critics: Twins, moved: Tensor, tokens: Tokens, scene: Scene, pairs: Tensor, search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The best pushes of each table: their values (n, M), slots of their tokens, and which.
 
@@ -37,27 +47,26 @@ def best(
         tokens: the set.
         scene: n tables.
         pairs: (2, n, k) slots of the tokens that may be pushed, and of those beside them.
-        drawn: (n * k, P) numbers of pushes.
-        count: of pushes of each token that are looked at: the half after which least is left to go
-            if it is alone, and the first that were drawn.
-        most: M, those that are least worse than the best of the same token.
-        allowed: (n, k) which may be pushed; None: all that are not in their places.
+        search: for which pushes.
     """
     _, size, each = pairs.shape
     flat, beside = pairs.flatten(1)
     seen = seen_by(tokens, scene.repeated(each), flat, beside)
-    which = _looked_at(tokens, seen, moved, drawn, count)
+    count = search.count
+    which = _looked_at(tokens, seen, moved, search.drawn, count)
     own = seen.which[:, None]
     numbers, never = pushes(
         tokens, seen, tokens.begins[own, which], tokens.ends[own, which], moved[own, which]
     )
-    one = torch.arange(size, device=drawn.device).repeat_interleave(each)
-    left = (scene.present & ~tokens.placed(scene))[one, flat]
-    if allowed is not None:
-        left = left & allowed.flatten()
-    never = never | ~left[:, None]
-    values = torch.where(never, _NEVER, critics.one(0, seen, numbers)).view(size, each * count)
-    most = min(most, values.shape[1])
+    one = torch.arange(size, device=flat.device).repeat_interleave(each)
+    left = scene.present & ~tokens.placed(scene)
+    never = (never | ~left[one, flat][:, None]).view(size, each, count)
+    if search.eligible is not None:
+        others = never | ~search.eligible[..., None]
+        never = torch.where(others.all((1, 2), keepdim=True), never, others)
+    values = critics.one(0, seen, numbers).view(size, each, count)
+    values = torch.where(never, _NEVER, values).flatten(1)
+    most = min(search.most, values.shape[1])
     if most > 1:
         own_best = values.view(size, each, count).amax(2, keepdim=True).expand(-1, -1, count)
         less = torch.where(values > _NEVER, values - own_best.reshape(size, -1), _NEVER)
@@ -66,7 +75,7 @@ def best(
     else:
         values, at = values.max(1, keepdim=True)
     slot, push = at // count, at % count
-    row = torch.arange(size, device=drawn.device)[:, None] * each + slot
+    row = torch.arange(size, device=flat.device)[:, None] * each + slot
     rows = row.flatten()
     other = critics.one(1, _only(seen, rows), numbers[row, push].flatten(0, 1)[:, None])
     return torch.minimum(values, other.view_as(values)), pairs[0].gather(1, slot), which[row, push]

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from tangram_agent.agents.push.actor import Played
 from tangram_agent.agents.push.agent import PushingConfig
-from tangram_agent.agents.push.choosing import best
+from tangram_agent.agents.push.choosing import Search, best
 from tangram_agent.agents.push.networks import Alone, Twins
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, rotated
 from tangram_agent.agents.push.seen import beside, pushes, seen_by
@@ -230,7 +230,8 @@ class PushLearner(NetworkLearner):
         scene, count = seen.at(seen.following), config.targets_looked_at
         pair = torch.stack([seen.slots, seen.others], dim=1)
         pairs = torch.stack([pair, pair.flip(1)])
-        value = best(critic, self.table.moved, tokens, scene, pairs, seen.drawn, count)[0][:, 0]
+        search = Search(seen.drawn, count)
+        value = best(critic, self.table.moved, tokens, scene, pairs, search)[0][:, 0]
         least = -1.0 / (1.0 - config.gamma)
         before, after = (tokens.placed(one) for one in (seen.at(seen.poses), scene))
         lost = (before & ~after & scene.present).scatter(1, pair, value=False).sum(1)

@@ -11,6 +11,7 @@ from shapely.geometry import Point, Polygon
 
 from tangram_agent.agents.push.actor import PushActor
 from tangram_agent.agents.push.agent import Pushing, PushingConfig
+from tangram_agent.agents.push.choosing import Search
 from tangram_agent.agents.push.learner import Batch, PushLearner, PushReplay
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, distance, gap, rotated
 from tangram_agent.agents.push.seen import beside, pushes, seen_by
@@ -39,6 +40,10 @@ SOME = Push(TokensConfig(tuple(SEVEN), 0.6), PushConfig(count=3))
 
 def generators(role: str, first: int, count: int) -> Generators:
     return [episode_generator(0, role, 0, 0, first + i) for i in range(count)]
+
+
+def now(corners: np.ndarray) -> History:
+    return History({"corners": corners[:, None]}, np.zeros((len(corners), 0, 4), np.float32))
 
 
 def played(task: Push, learner: Learner, agent: Pushing, count: int = 6) -> Played:
@@ -206,7 +211,7 @@ def test_a_push_that_is_tried_in_the_engine_is_known_to_lead_home() -> None:
             assert after is not None
             goals[table] = after
     assert not TWO.placed(corners, goals).all(axis=1).any()
-    assert actor._tried(corners, goals, actions).tolist() == place
+    assert actor._tried(corners, goals, actions, now(corners)).tolist() == place
 
 
 def test_pushes_of_every_token_that_is_not_in_place_are_tried() -> None:
@@ -218,7 +223,7 @@ def test_pushes_of_every_token_that_is_not_in_place_are_tried() -> None:
     goals[:, 1] = found.poses[:, 1]
     found = replace(found, goals=goals)
     drawn = torch.arange(PUSHES).expand(15, -1)
-    _, slots, _ = actor._best(found, actor._pairs(found), drawn, 40, most=12)
+    _, slots, _ = actor._best(found, actor._pairs(found), Search(drawn, 40, most=12))
     assert all(set(row) == {0, 2} for row in slots.tolist())
 
 
@@ -238,22 +243,55 @@ def test_a_push_that_the_engine_refuses_is_not_the_best_though_it_harms_nothing(
         elif not TWO.placed(after[None], goals)[0, 0]:
             harms.append(push)
     actions = np.stack([refused[0], harms[0]])[None]
-    assert actor._tried(corners, goals, actions).tolist() == [1]
+    assert actor._tried(corners, goals, actions, now(corners)).tolist() == [1]
 
 
 def test_where_all_is_in_place_nothing_is_left_to_go() -> None:
     actor, found = Pushing(SMALL).actor(SOME), scene(SOME, 3)
     assert isinstance(actor, PushActor)
-    assert actor._worth(replace(found, goals=found.poses)).tolist() == [0.0, 0.0, 0.0]
-    assert (actor._worth(found) < 0.0).all()
+    assert not actor._values(replace(found, goals=found.poses)).any()
+    assert (actor._values(found) < 0.0).all()
+
+
+def test_tokens_that_are_not_next_are_pushed_only_where_no_other_can_be() -> None:
+    actor = Pushing(SMALL).actor(SOME)
+    assert isinstance(actor, PushActor)
+    actor.load(Pushing(SMALL).learner(SOME, 0, "cpu").broadcast())
+    found = scene(SOME, 4)
+    drawn = torch.arange(PUSHES).expand(12, -1)
+    eligible = torch.tensor([[False, True, True], [True, False, False]] * 2)
+    search = Search(drawn, 40, 8, eligible)
+    _, slots, _ = actor._best(found, actor._pairs(found), search)
+    assert [set(row) for row in slots.tolist()] == [{1, 2}, {0}] * 2
+    found.poses[0, 1:, 0] = found.poses[2, 1:, 0] = 1.5  # out of the finger's reach
+    _, slots, _ = actor._best(found, actor._pairs(found), search)
+    assert [set(row) for row in slots.tolist()] == [{0}, {0}] * 2
+
+
+def test_what_has_been_before_is_not_sought_again() -> None:
+    actor = Pushing(SMALL).actor(TWO)
+    assert isinstance(actor, PushActor)
+    with closing(TWO.make(1)) as env:
+        seen = env.reset(generators("test", 0, 1))
+    corners, goals = seen["corners"], seen["goals"]
+    home, other = np.array([-0.9, 0.1, 0.3]), np.array([-0.1, 0.2, -0.3])
+    actions = np.stack([np.append(-0.5, home), np.append(-0.5, other)])[None]
+    trials = Trials(TWO)
+    trials.begin(corners[0], goals[0], middle(TWO))
+    after = trials.after(actions[0, 0])
+    assert after is not None
+    goals = after[None]  # but it was there
+    past = now(corners)
+    assert actor._tried(corners, goals, actions, past).tolist() == [0]
+    past.seen["corners"] = np.stack([after, corners[0]])[None]
+    assert actor._tried(corners, goals, actions, past).tolist() == [1]
 
 
 def test_no_more_pushes_are_tried_than_there_are() -> None:
     actor = Pushing(replace(SMALL, tried=1000)).actor(SQUARE)
     with closing(SQUARE.make(1)) as env:
-        assert actor.act(
-            env.reset(generators("test", 0, 1)), History({}, np.zeros((1, 0, 4)))
-        ).shape == (1, 4)
+        seen = env.reset(generators("test", 0, 1))
+    assert actor.act(seen, now(seen["corners"])).shape == (1, 4)
 
 
 def test_hindsight_takes_whole_tokens_of_what_was_reached() -> None:
