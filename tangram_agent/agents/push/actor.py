@@ -92,8 +92,8 @@ class PushActor(NetworkActor):
     def _tried(self, corners: Array, goals: Array, actions: Floats, past: History) -> torch.Tensor:
         """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine.
 
-        What the tokens that it moves are then worth, less what they are now. What has been before
-        is not sought again.
+        What the tokens that it moves are then worth, less what they are now. What has been before,
+        and brings no token home, is not sought again.
         """
         known, each = middle(self._task), actions.shape[1]
         after = np.repeat(corners[:, None], each, axis=1)
@@ -110,7 +110,12 @@ class PushActor(NetworkActor):
         stays = (then.poses - now.repeated(each).poses).abs().amax(-1) < _SAME
         gained = torch.where(stays, 0.0, self._values(then) - was).sum(1).view(len(corners), -1)
         way = np.abs(after[:, :, None] - past.seen["corners"][:, None]).max(axis=(3, 4)).min(axis=2)
-        again = torch.from_numpy(way < self._task.config.within / 2.0)
+        more = self._tokens.placed(then).sum(1) > self._tokens.placed(now).sum(1).repeat_interleave(
+            each
+        )
+        again = torch.from_numpy(way < self._task.config.within / 2.0) & ~more.view(
+            len(corners), -1
+        )
         gained = torch.where(again, gained - _AGAIN, gained)
         return torch.where(torch.from_numpy(refused), -torch.inf, gained).argmax(1)
 

@@ -280,7 +280,7 @@ def test_what_has_been_before_is_not_sought_again() -> None:
     trials.begin(corners[0], goals[0], middle(TWO))
     after = trials.after(actions[0, 0])
     assert after is not None
-    goals = after[None]  # but it was there
+    goals = after[None] + np.array([0.04, 0.0])  # near, but it was there
     past = now(corners)
     assert actor._tried(corners, goals, actions, past).tolist() == [0]
     past.seen["corners"] = np.stack([after, corners[0]])[None]
