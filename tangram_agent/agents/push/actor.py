@@ -15,7 +15,7 @@ from tangram_agent.agents.push.networks import Table, Twins
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens
 from tangram_agent.agents.push.seen import beside
 from tangram_agent.base.acting import NetworkActor
-from tangram_core.arrays import Floats, Singles
+from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
 from tangram_tasks.push.order import come_next
@@ -95,8 +95,24 @@ class PushActor(NetworkActor):
         What the tokens that it moves are then worth, less what they are now. What has been before,
         and brings no token home, is not sought again.
         """
-        known, each = middle(self._task), actions.shape[1]
-        after = np.repeat(corners[:, None], each, axis=1)
+        after, refused = self._followed(corners, goals, actions)
+        tokens, times = self._tokens, actions.shape[1]
+        now = tokens.scene(corners, goals)
+        before, was = now.repeated(times), self._values(now).repeat_interleave(times, 0)
+        then = tokens.scene(after.reshape(-1, *corners.shape[1:]), goals.repeat(times, axis=0))
+        moves = (then.poses - before.poses).abs().amax(-1) > _SAME
+        gained = torch.where(moves, self._values(then) - was, 0.0).sum(1)
+        comes_home = tokens.placed(then).sum(1) > tokens.placed(before).sum(1)
+        way = np.abs(after[:, :, None] - past.seen["corners"][:, None]).max(axis=(3, 4)).min(axis=2)
+        again = torch.from_numpy(way < self._task.config.within / 2.0).flatten() & ~comes_home
+        gained = torch.where(again, gained - _AGAIN, gained)
+        gained[torch.from_numpy(refused).flatten()] = -torch.inf
+        return gained.view(len(corners), -1).argmax(1)
+
+    def _followed(self, corners: Array, goals: Array, actions: Floats) -> tuple[Array, Bools]:
+        """Corners (B, M, V, 2) after pushes (B, M, 4) in an engine; which (B, M) are refused."""
+        known = middle(self._task)
+        after = np.repeat(corners[:, None], actions.shape[1], axis=1)
         refused = np.zeros(after.shape[:2], np.bool_)
         for table in np.flatnonzero(~self._task.placed(corners, goals).all(axis=1)).tolist():
             self._trials.begin(corners[table], goals[table], known)
@@ -104,20 +120,7 @@ class PushActor(NetworkActor):
                 found = self._trials.after(push)
                 refused[table, number] = found is None
                 after[table, number] = corners[table] if found is None else found
-        flat, wanted = after.reshape(-1, *corners.shape[1:]), goals.repeat(each, axis=0)
-        then, now = self._tokens.scene(flat, wanted), self._tokens.scene(corners, goals)
-        was = self._values(now).repeat_interleave(each, 0)
-        stays = (then.poses - now.repeated(each).poses).abs().amax(-1) < _SAME
-        gained = torch.where(stays, 0.0, self._values(then) - was).sum(1).view(len(corners), -1)
-        way = np.abs(after[:, :, None] - past.seen["corners"][:, None]).max(axis=(3, 4)).min(axis=2)
-        more = self._tokens.placed(then).sum(1) > self._tokens.placed(now).sum(1).repeat_interleave(
-            each
-        )
-        again = torch.from_numpy(way < self._task.config.within / 2.0) & ~more.view(
-            len(corners), -1
-        )
-        gained = torch.where(again, gained - _AGAIN, gained)
-        return torch.where(torch.from_numpy(refused), -torch.inf, gained).argmax(1)
+        return after, refused
 
     def _values(self, scene: Scene) -> torch.Tensor:
         """(n, K) of tokens, each with the one beside it; 0 of those in their places."""
