@@ -2,7 +2,8 @@
 
 A place is the freer the more directions lead out of it past the tokens that lie already. Convex
 shapes can always be laid so that each slides in from one side. The best order leaves the least
-free place as free as can be; it is looked for among all of them.
+free place as free as can be; it is looked for among all of them. Once a place is shut it says
+nothing any more: all may come next that leave no other less free.
 
 Legend: K tokens, n of them on the table, V corners, D directions; a set of tokens is a number with
 a bit for each.
@@ -14,7 +15,7 @@ import numpy as np
 
 from tangram_core.arrays import AnyArray, Bools, Floats, Ints
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import shared_area
+from tangram_sim.geometry.overlap import shared_areas
 from tangram_tasks.push.places import on_table
 
 DIRECTIONS = 48
@@ -26,9 +27,9 @@ COVERED = 0.1  # share of a token on another's place that must go first
 
 
 def come_next(layout: Layout, corners: AnyArray, goals: AnyArray, placed: Bools) -> Bools:
-    """(K,) which tokens may be pushed: the next of a best order, and what lies in their places.
+    """(K,) which tokens may be pushed: the next of a best order, and those that lie where they go.
 
-    Of more than MOST tokens any, as there are too many orders.
+    Of more than MOST on the table any that is not in its place: there are too many orders.
 
     Args:
         layout: the tokens.
@@ -36,21 +37,21 @@ def come_next(layout: Layout, corners: AnyArray, goals: AnyArray, placed: Bools)
         goals: (V, 2) of their places.
         placed: (K,) which are in them.
     """
-    found = on_table(goals, layout) & ~placed
-    tokens = np.flatnonzero(on_table(goals, layout))
+    there = on_table(goals, layout)
+    found, tokens = there & ~placed, np.flatnonzero(there)
     if len(tokens) > MOST or not found.any():
         return found
     best, through = _orders(layout, np.asarray(goals, np.float64).tobytes())
     lies = int((placed[tokens] << np.arange(len(tokens))).sum())
     following = through[lies] >= best[lies]
     here, places = (at[layout.padded_corners[tokens]] for at in (corners, goals))
-    over = shared_area(*_all_pairs(here, places)).reshape(len(tokens), -1)
+    over = shared_areas(here[None], places[None])[0]
     lies_on = (over > COVERED * layout.areas[tokens, None]) & ~np.eye(len(tokens), dtype=np.bool_)
-    found[tokens] &= following | (lies_on & following & ~placed[tokens]).any(axis=1)
+    found[tokens] &= following | (lies_on & following).any(axis=1)
     return found
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=128)
 def _orders(layout: Layout, goals: bytes) -> tuple[Ints, Ints]:
     """Of each set that lies, how free the least free place will be: (2**n,), by token (2**n, n).
 
@@ -74,12 +75,7 @@ def _free(layout: Layout, corners: Floats, tokens: Ints) -> Bools:
     outlines = corners[layout.padded_corners[tokens]]
     ways = np.exp(2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)[:, None] * np.array(MOVED)
     steps = np.stack([ways.real, ways.imag], axis=-1).reshape(-1, 1, 1, 2)
-    first, second = _all_pairs((outlines + steps).reshape(-1, *outlines.shape[1:]), outlines)
-    over = shared_area(first, second).reshape(DIRECTIONS, len(MOVED), len(tokens), -1)
+    places = np.broadcast_to(outlines, (len(steps), *outlines.shape))
+    over = shared_areas(outlines + steps, places).reshape(DIRECTIONS, len(MOVED), len(tokens), -1)
     free: Bools = np.all(over <= ASIDE * layout.areas[tokens, None], axis=1)
     return np.moveaxis(free, 0, -1)
-
-
-def _all_pairs(some: Floats, others: Floats) -> tuple[Floats, Floats]:
-    """Each of some polygons (n, C, 2) with each of others (m, C, 2): (n * m, C, 2) of both."""
-    return some.repeat(len(others), axis=0), np.tile(others, (len(some), 1, 1))

@@ -146,19 +146,28 @@ class Planner:
         self, corners: Floats, goals: Floats, count: int, rng: np.random.Generator
     ) -> list[tuple[float, Floats]]:
         """About so many pushes (4,), each after its cost: what is left if it is alone."""
-        task, layout = self._task, self._layout
-        poses, desired = layout.poses(corners), layout.poses(goals)
-        present = on_table(goals, layout)
+        task, present = self._task, on_table(goals, self._layout)
         placed = task.placed(corners[None], goals[None])[0]
-        left = np.flatnonzero(come_next(layout, corners, goals, placed)).tolist()
+        following, left = come_next(self._layout, corners, goals, placed), present & ~placed
+        found = self._of(following, corners, goals, count, rng)
+        if all(cost > BLOCKED / 2.0 for cost, _ in found) and (following != left).any():
+            return self._of(left, corners, goals, count, rng)
+        return found
+
+    def _of(
+        self, those: Bools, corners: Floats, goals: Floats, count: int, rng: np.random.Generator
+    ) -> list[tuple[float, Floats]]:
+        """The same of some tokens (K,)."""
+        layout, tokens = self._layout, np.flatnonzero(those).tolist()
+        poses, desired = layout.poses(corners), layout.poses(goals)
         found: list[tuple[float, Floats]] = []
-        for token in left:
+        for token in tokens:
             error = _error(poses[token], desired[token])
             chosen, costs = self._ranked(token, error, rng)
-            clear = self._clear(token, chosen, poses, present)
+            clear = self._clear(token, chosen, poses, on_table(goals, layout))
             costs = np.where(clear, costs, costs + BLOCKED) - self._cost(token, error[None])[0]
             named = (token + 0.5) / layout.tokens * 2.0 - 1.0
-            for i in np.argsort(costs)[: max(1, count // len(left))].tolist():
+            for i in np.argsort(costs)[: max(1, count // len(tokens))].tolist():
                 action = np.append(named, self._tried[token].actions[chosen[i]])
                 found.append((float(costs[i]), action))
         return found

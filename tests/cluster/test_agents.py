@@ -20,6 +20,7 @@ def test_an_agent_of_the_package_is_scored_from_any_folder(tmp_path: Path, name:
         "seed=1",
         "out=scores.json",
         "rivals=[]",
+        *(["task.count=2"] if name == "hand" else []),
     )
     run_here("tangram-eval", *arguments, cwd=tmp_path)
     scores = json.loads((tmp_path / "scores.json").read_text())

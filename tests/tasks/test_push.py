@@ -20,7 +20,7 @@ from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
 from tangram_tasks.push.order import come_next
-from tangram_tasks.push.places import AWAY, on_table, push_of
+from tangram_tasks.push.places import AWAY, corners_of, on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
 from tangram_tasks.push.trials import middle
 
@@ -330,3 +330,20 @@ def test_the_middle_of_a_row_comes_before_its_second_end() -> None:
     poses = np.array([[-side, 0.0, 0.0], [0.7, 0.7, 0.0], [side / 2.0, 0.1, 0.0]])
     found = come_next(layout, layout.corners(poses), goals, np.array([True, False, False]))
     assert found.tolist() == [False, True, True]  # the last lies in the middle
+
+
+def test_rivals_push_what_comes_next_and_others_where_that_cannot_be(
+    few_tried: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layout = SOME.layout
+    poses = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [9.0, 9.0, 0.0]])
+    present = np.array([True, True, False])
+    corners = corners_of(layout, poses, present)
+    goals = corners_of(layout, poses + [0.0, 0.4, 0.0], present)
+    with closing(SOME.make(1)) as env:
+        planner = rival_module.Planner(SOME, env)  # type: ignore[arg-type]
+    for following, pushed in (([0, 1, 0], {1}), ([1, 0, 0], {0}), ([0, 0, 0], {0, 1})):
+        next_ones = np.array(following, np.bool_)
+        monkeypatch.setattr(rival_module, "come_next", lambda *_, found=next_ones: found)
+        found = planner._proposed(corners, goals, 10, np.random.default_rng(0))
+        assert {int((push[0] + 1.0) / 2.0 * 3) for _, push in found} == pushed

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from tangram_agent.agents.push.agent import PushingConfig
-from tangram_agent.agents.push.choosing import Search, best
+from tangram_agent.agents.push.choosing import NEVER, Search, best
 from tangram_agent.agents.push.networks import Table, Twins
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens
 from tangram_agent.agents.push.seen import beside
@@ -25,7 +25,7 @@ from tangram_tasks.push.trials import Trials, middle
 CPU = torch.device("cpu")
 _THEN = 32  # pushes of each token that are looked at after one that is tried out
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
-_SAME = 0.003  # what is nearer has not moved
+_SAME = 0.003  # a token that moves and turns less has not moved
 _AGAIN = 100.0  # cost of what has been before
 
 
@@ -60,11 +60,11 @@ class PushActor(NetworkActor):
         most = max(1, tried) if explore is None else 1
         count = min(times * self._config.looked_at, PUSHES)
         search = Search(drawn, count, most, self._next(scene, corners, goals))
-        _, slots, found = self._best(scene, self._pairs(scene), search)
+        values, slots, found = self._best(scene, self._pairs(scene), search)
         which = scene.which.gather(1, slots)
         if most > 1:
             options = tokens.actions[which.numpy(), found.numpy()]
-            at = self._tried(corners, goals, options, past)[:, None]
+            at = self._tried(corners, goals, options, (values > NEVER).numpy(), past)[:, None]
             which, found = which.gather(1, at), found.gather(1, at)
         chosen, pushes = (one[:, 0].numpy().copy() for one in (which, found))
         if explore is not None:
@@ -89,47 +89,57 @@ class PushActor(NetworkActor):
         following = np.stack([come_next(self._task.layout, *row) for row in rows])
         return torch.from_numpy(following).gather(1, scene.which)
 
-    def _tried(self, corners: Array, goals: Array, actions: Floats, past: History) -> torch.Tensor:
+    def _tried(
+        self, corners: Array, goals: Array, actions: Floats, possible: Bools, past: History
+    ) -> torch.Tensor:
         """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine.
 
-        What the tokens that it moves are then worth, less what they are now. What has been before,
-        and brings no token home, is not sought again.
+        What the tokens that it moves are then worth, less what they are now. What moves hardly
+        anything, or leads to what has been before, is not sought: but for one that brings a token
+        home. Nor is what is not possible (B, M), or what the engine refuses.
         """
-        after, refused = self._followed(corners, goals, actions)
+        after, refused = self._followed(corners, goals, actions, possible)
         tokens, times = self._tokens, actions.shape[1]
-        now = tokens.scene(corners, goals)
-        before, was = now.repeated(times), self._values(now).repeat_interleave(times, 0)
+        before = tokens.scene(corners, goals).repeated(times)
         then = tokens.scene(after.reshape(-1, *corners.shape[1:]), goals.repeat(times, axis=0))
-        moves = (then.poses - before.poses).abs().amax(-1) > _SAME
-        gained = torch.where(moves, self._values(then) - was, 0.0).sum(1)
+        moved = (then.poses - before.poses).abs().amax(-1) > _SAME
+        gained = (self._values(then, moved) - self._values(before, moved)).sum(1)
         comes_home = tokens.placed(then).sum(1) > tokens.placed(before).sum(1)
-        way = np.abs(after[:, :, None] - past.seen["corners"][:, None]).max(axis=(3, 4)).min(axis=2)
-        again = torch.from_numpy(way < self._task.config.within / 2.0).flatten() & ~comes_home
+        nearest = np.full(refused.shape, np.inf)  # what it leads to, to what has been
+        for moment in np.moveaxis(past.seen["corners"], 1, 0):
+            np.minimum(nearest, np.abs(after - moment[:, None]).max(axis=(2, 3)), out=nearest)
+        again = torch.from_numpy(nearest < self._task.config.within / 2.0).flatten() & ~comes_home
         gained = torch.where(again, gained - _AGAIN, gained)
         gained[torch.from_numpy(refused).flatten()] = -torch.inf
         return gained.view(len(corners), -1).argmax(1)
 
-    def _followed(self, corners: Array, goals: Array, actions: Floats) -> tuple[Array, Bools]:
+    def _followed(
+        self, corners: Array, goals: Array, actions: Floats, possible: Bools
+    ) -> tuple[Array, Bools]:
         """Corners (B, M, V, 2) after pushes (B, M, 4) in an engine; which (B, M) are refused."""
         known = middle(self._task)
         after = np.repeat(corners[:, None], actions.shape[1], axis=1)
-        refused = np.zeros(after.shape[:2], np.bool_)
+        refused = ~possible
         for table in np.flatnonzero(~self._task.placed(corners, goals).all(axis=1)).tolist():
             self._trials.begin(corners[table], goals[table], known)
-            for number, push in enumerate(actions[table]):
-                found = self._trials.after(push)
+            for number in np.flatnonzero(possible[table]).tolist():
+                found = self._trials.after(actions[table, number])
                 refused[table, number] = found is None
                 after[table, number] = corners[table] if found is None else found
         return after, refused
 
-    def _values(self, scene: Scene) -> torch.Tensor:
-        """(n, K) of tokens, each with the one beside it; 0 of those in their places."""
-        rows, slots = (scene.present & ~self._tokens.placed(scene)).nonzero(as_tuple=True)
+    def _values(self, scene: Scene, wanted: torch.Tensor) -> torch.Tensor:
+        """(n, K) of tokens that are wanted (n, K), each with the one beside it; of others 0.
+
+        And of those in their places.
+        """
+        asked = scene.present & wanted & ~self._tokens.placed(scene)
+        rows, slots = asked.nonzero(as_tuple=True)
         some = scene.only(rows)
         pairs = torch.stack([slots, beside(some, slots)])[..., None]
         value = self._best(some, pairs, Search(_all_pushes(len(rows)), _THEN))[0][:, 0]
         least = -1.0 / (1.0 - self._config.gamma)
-        found = torch.zeros(scene.present.shape)
+        found = torch.zeros(asked.shape)
         found[rows, slots] = value.clamp(least, -0.5)  # one more push at least
         return found
 

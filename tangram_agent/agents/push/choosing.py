@@ -12,7 +12,7 @@ from tangram_agent.agents.push.networks import Twins
 from tangram_agent.agents.push.scenes import Scene, Tokens
 from tangram_agent.agents.push.seen import Seen, pushes, seen_by
 
-_NEVER = -1e3  # value of what cannot be done
+NEVER = -1e3  # value of what cannot be done
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +36,11 @@ class Search:
 def best(
     critics: Twins, moved: Tensor, tokens: Tokens, scene: Scene, pairs: Tensor, search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The best pushes of each table: their values (n, M), slots of their tokens, and which.
+    """The best pushes of each table: values (n, M), slots of their tokens, and which.
 
     One critic chooses, the lesser of both says what they are worth: until a token and the one
-    beside it are in their places. Those in their places are not pushed.
+    beside it are in their places. NEVER is the value of what cannot be done, or may not: those in
+    their places are not pushed.
 
     Args:
         critics: who value.
@@ -65,11 +66,11 @@ def best(
         others = never | ~search.eligible[..., None]
         never = torch.where(others.all((1, 2), keepdim=True), never, others)
     values = critics.one(0, seen, numbers).view(size, each, count)
-    values = torch.where(never, _NEVER, values).flatten(1)
+    values = torch.where(never, NEVER, values).flatten(1)
     most = min(search.most, values.shape[1])
     if most > 1:
         own_best = values.view(size, each, count).amax(2, keepdim=True).expand(-1, -1, count)
-        less = torch.where(values > _NEVER, values - own_best.reshape(size, -1), _NEVER)
+        less = torch.where(values > NEVER, values - own_best.reshape(size, -1), NEVER)
         at = less.topk(most, dim=1).indices
         values = values.gather(1, at)
     else:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from shapely.geometry import Point, Polygon
 
+import tangram_agent.agents.push.actor as actor_module
 from tangram_agent.agents.push.actor import PushActor
 from tangram_agent.agents.push.agent import Pushing, PushingConfig
 from tangram_agent.agents.push.choosing import Search
@@ -21,7 +22,7 @@ from tangram_core.errors import ConfigError
 from tangram_core.seeding import episode_generator
 from tangram_core.task import Generators, History, Played
 from tangram_sim.geometry.layout import TokensConfig
-from tangram_tasks.push.places import push_of
+from tangram_tasks.push.places import on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
 from tangram_tasks.push.trials import Trials, middle
 from tests.agent.builders import PAIR, setup
@@ -44,6 +45,13 @@ def generators(role: str, first: int, count: int) -> Generators:
 
 def now(corners: np.ndarray) -> History:
     return History({"corners": corners[:, None]}, np.zeros((len(corners), 0, 4), np.float32))
+
+
+def tried(
+    actor: PushActor, corners: np.ndarray, goals: np.ndarray, actions: np.ndarray
+) -> torch.Tensor:
+    possible = np.ones(actions.shape[:2], np.bool_)
+    return actor._tried(corners, goals, actions, possible, now(corners))
 
 
 def played(task: Push, learner: Learner, agent: Pushing, count: int = 6) -> Played:
@@ -211,7 +219,7 @@ def test_a_push_that_is_tried_in_the_engine_is_known_to_lead_home() -> None:
             assert after is not None
             goals[table] = after
     assert not TWO.placed(corners, goals).all(axis=1).any()
-    assert actor._tried(corners, goals, actions, now(corners)).tolist() == place
+    assert tried(actor, corners, goals, actions).tolist() == place
 
 
 def test_pushes_of_every_token_that_is_not_in_place_are_tried() -> None:
@@ -243,14 +251,15 @@ def test_a_push_that_the_engine_refuses_is_not_the_best_though_it_harms_nothing(
         elif not TWO.placed(after[None], goals)[0, 0]:
             harms.append(push)
     actions = np.stack([refused[0], harms[0]])[None]
-    assert actor._tried(corners, goals, actions, now(corners)).tolist() == [1]
+    assert tried(actor, corners, goals, actions).tolist() == [1]
 
 
 def test_where_all_is_in_place_nothing_is_left_to_go() -> None:
     actor, found = Pushing(SMALL).actor(SOME), scene(SOME, 3)
     assert isinstance(actor, PushActor)
-    assert not actor._values(replace(found, goals=found.poses)).any()
-    assert (actor._values(found) < 0.0).all()
+    some = torch.tensor([True, False, True]).expand(3, -1)
+    assert not actor._values(replace(found, goals=found.poses), some).any()
+    assert ((actor._values(found, some) < 0.0) == some).all()
 
 
 def test_tokens_that_are_not_next_are_pushed_only_where_no_other_can_be() -> None:
@@ -268,23 +277,45 @@ def test_tokens_that_are_not_next_are_pushed_only_where_no_other_can_be() -> Non
     assert [set(row) for row in slots.tolist()] == [{0}, {0}] * 2
 
 
-def test_what_has_been_before_is_not_sought_again() -> None:
+def test_that_token_is_pushed_that_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    for times in (1, 1000):  # more are tried than the one token has
+        actor = Pushing(replace(SMALL, tried=times)).actor(SOME)
+        actor.load(Pushing(SMALL).learner(SOME, 0, "cpu").broadcast())
+        with closing(SOME.make(3)) as env:
+            seen = env.reset(generators("test", 0, 3))
+        there = on_table(seen["goals"], SOME.layout)
+        for place in range(3):
+            following = np.stack([np.arange(7) == np.flatnonzero(row)[place] for row in there])
+            rows = iter(following)
+            monkeypatch.setattr(actor_module, "come_next", lambda *_, rows=rows: next(rows))
+            actions = actor.act(seen, now(seen["corners"]))
+            pushed = ((actions[:, 0] + 1.0) / 2.0 * 7).astype(int)
+            assert pushed.tolist() == following.argmax(1).tolist()
+
+
+def test_what_has_been_before_is_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nearer(self: PushActor, scene: Scene, wanted: torch.Tensor) -> torch.Tensor:
+        far: torch.Tensor = (scene.goals - scene.poses)[..., :2].norm(dim=-1)
+        return torch.where(wanted, -far, 0.0)
+
+    monkeypatch.setattr(PushActor, "_values", nearer)
     actor = Pushing(SMALL).actor(TWO)
     assert isinstance(actor, PushActor)
     with closing(TWO.make(1)) as env:
         seen = env.reset(generators("test", 0, 1))
     corners, goals = seen["corners"], seen["goals"]
-    home, other = np.array([-0.9, 0.1, 0.3]), np.array([-0.1, 0.2, -0.3])
-    actions = np.stack([np.append(-0.5, home), np.append(-0.5, other)])[None]
+    pushes = [-0.5, -0.9, 0.1, 0.3], [-0.5, -0.1, 0.2, -0.3]
+    actions, possible = np.array([pushes]), np.ones((1, 2), np.bool_)
     trials = Trials(TWO)
     trials.begin(corners[0], goals[0], middle(TWO))
     after = trials.after(actions[0, 0])
     assert after is not None
-    goals = after[None] + np.array([0.04, 0.0])  # near, but it was there
     past = now(corners)
-    assert actor._tried(corners, goals, actions, past).tolist() == [0]
-    past.seen["corners"] = np.stack([after, corners[0]])[None]
-    assert actor._tried(corners, goals, actions, past).tolist() == [1]
+    for away, before, chosen in ((0.04, False, 0), (0.04, True, 1), (0.02, True, 0)):
+        goals = after[None] + np.array([away, 0.0])  # in its place from 0.03 on
+        past.seen["corners"] = np.stack([after if before else corners[0], corners[0]])[None]
+        assert actor._tried(corners, goals, actions, possible, past).tolist() == [chosen]
+    assert actor._tried(corners, goals, actions, ~np.array([[True, False]]), past).tolist() == [1]
 
 
 def test_no_more_pushes_are_tried_than_there_are() -> None:
