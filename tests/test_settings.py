@@ -161,7 +161,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.entropy": (SAC, 0.5),
     "agent.width": (PUSH, 9),
     "agent.looked_at": (PUSH, 64),
-    "agent.tried": (PUSH, 4),
+    "agent.tried": (PUSH, 64),
     "agent.targets_looked_at": (PUSH, 2),
     "agent.some_share": (PUSH, 1.0),
     "task.count": (PUSH, 1),
