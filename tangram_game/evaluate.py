@@ -117,7 +117,8 @@ def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
     whole, task = tests.play(player(tests.env)), tests.task
     scores: Scores = {**task.score(whole), "episodes": float(whole.episodes.count)}
     if not isinstance(task, Place):
-        return scores
+        ended = whole.episodes.terminated.cumsum(axis=1) - whole.episodes.terminated
+        return scores | {"ms_per_decision": 1e3 * float(whole.chose.sum() / (ended == 0).sum())}
     played = Played.of(whole)
     if task.outlines:
         return scores | of_outlines(task, played, at_once)

@@ -28,15 +28,29 @@ BUDGET = ("max_updates", "max_episodes", "max_hours")  # how a training ends tha
 
 
 class Work:
-    """One training with one seed, then its tests, as one process after another."""
+    """One training with one seed, then its tests, as one process after another.
 
-    def __init__(self, job: Job, run_dir: Path, missing: Sequence[str]) -> None:
-        self.job, self.run_dir, self.missing = job, run_dir, list(missing)
+    Args:
+        job: what it is.
+        run_dir: its own.
+        missing: tests without a row.
+        first: whose agent it goes on with.
+    """
+
+    def __init__(
+        self, job: Job, run_dir: Path, missing: Sequence[str], first: "Work | None"
+    ) -> None:
+        self.job, self.run_dir, self.missing, self.first = job, run_dir, list(missing), first
 
     @property
     def trained(self) -> bool:
         """Whether the run used up its budget."""
         return str(read_json(self.run_dir / "result.json").get("ended_by")).startswith(BUDGET)
+
+    @property
+    def ready(self) -> bool:
+        """Whether nothing has to be trained before it."""
+        return self.first is None or self.first.trained
 
     def scores(self, test: str) -> Path:
         """The file that a test leaves."""
@@ -55,6 +69,8 @@ class Work:
         """The process that comes next; None where all is done."""
         if not self.trained:
             told = ["train", override("run_dir", str(self.run_dir)), f"seed={self.job.seed}"]
+            if self.first:
+                told.append(override("warm_start", str(self.first.run_dir)))
             return self._child([*told, "resume=auto", *self.job.told], "training.log")
         for test in self.missing:
             if not self.scores(test).exists():
@@ -105,13 +121,16 @@ def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int
     """
     root, out = Path(config.run_dir), Path(config.out or config.run_dir)
     there = done(out / f"{config.study}.csv")
-    wanted = []
+    works: dict[tuple[str, int], Work] = {}
     for job in jobs:
         missing = [test for test in job.tests if (job.training, job.seed, test) not in there]
-        if missing:
-            run_dir = root / config.study / job.training / f"seed_{job.seed}"
-            wanted.append(Work(job, run_dir, missing))
-            wanted[-1].check()
+        run_dir = root / config.study / job.training / f"seed_{job.seed}"
+        first = works[job.after, job.seed] if job.after else None
+        works[job.training, job.seed] = Work(job, run_dir, missing, first)
+    firsts = [work.first for work in works.values() if work.missing]
+    wanted = [w for w in works.values() if w.missing or (w in firsts and not w.trained)]
+    for work in wanted:
+        work.check()
     console.print(f"{len(jobs) - len(wanted)} of {len(jobs)} runs are in {config.study}.csv")
     folder = RunFolder(root)
     folder.prepare("auto")
@@ -146,8 +165,12 @@ class Runner:
 
     def _work(self) -> None:
         while True:
-            while self._stop_s is None and self._waiting and len(self._running) < self._config.jobs:
-                self._go_on(self._waiting.pop(0))
+            while self._stop_s is None and len(self._running) < self._config.jobs:
+                work = next((work for work in self._waiting if work.ready), None)
+                if work is None:
+                    break
+                self._waiting.remove(work)
+                self._go_on(work)
             if not self._running:
                 return
             try:

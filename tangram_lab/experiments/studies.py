@@ -40,6 +40,7 @@ class Training(msgspec.Struct, forbid_unknown_fields=True):
         tests: names of tests.
         set: what it alone is told.
         seeds: how many, instead of the study's.
+        after: an earlier training, whose agent of the same seed it goes on with.
     """
 
     label: str
@@ -47,6 +48,7 @@ class Training(msgspec.Struct, forbid_unknown_fields=True):
     tests: tuple[str, ...]
     set: Overrides = ()
     seeds: int | None = None
+    after: str | None = None
 
 
 class Figure(msgspec.Struct, forbid_unknown_fields=True):
@@ -105,14 +107,17 @@ def read_studies(path: Path = FILE) -> Studies:
     except (OSError, ValueError, msgspec.ValidationError, yaml.YAMLError) as error:
         raise ConfigError(f"cannot read the studies of {path}: {error}") from None
     for name, study in found.studies.items():
+        earlier = list[str]()
         for key, training in study.trainings.items():
             for what, wanted, known in (
                 ("family", (training.family,), found.families),
                 ("test", training.tests, found.tests),
+                ("earlier training", [training.after] if training.after else [], earlier),
             ):
                 for one in wanted:
                     if one not in known:
                         raise ConfigError(f"{path}: {name}, {key}: there is no {what} '{one}'")
+            earlier.append(key)
     return found
 
 
@@ -145,6 +150,7 @@ class Job:
         told: what tangram-train is told.
         tests: name -> what tangram-eval is told.
         drawn: whether a figure shows how it learned.
+        after: the training that it goes on with.
     """
 
     training: str
@@ -153,6 +159,7 @@ class Job:
     told: Overrides
     tests: Mapping[str, Overrides]
     drawn: bool
+    after: str | None
 
     @property
     def name(self) -> str:
@@ -175,10 +182,10 @@ def jobs_of(config: StudyConfig, known: Studies) -> Iterator[Job]:
     drawn = {name for names in curves for name in names}
     for seed in range(max(counts.values())):
         for name, training in study.trainings.items():
-            if seed < counts[name]:
+            if seed < min(counts[name], counts[training.after or name]):
                 tests = {test: _test(known.tests[test], budget) for test in training.tests}
                 told = train_overrides(known, config.budget, training)
-                yield Job(name, training.label, seed, told, tests, name in drawn)
+                yield Job(name, training.label, seed, told, tests, name in drawn, training.after)
 
 
 def train_overrides(known: Studies, budget: str, training: Training) -> Overrides:

@@ -19,6 +19,7 @@ from tangram_lab.experiments.rows import (
     rows_of,
     spreads,
 )
+from tangram_lab.experiments.runner import Work
 from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 from tests.test_docs import ROOT, unknown
 
@@ -36,7 +37,7 @@ studies:
     seeds: 3
     trainings:
       one: {label: first, family: ours, tests: [as_trained, puzzles]}
-      two: {label: second, family: ours, seeds: 1, set: [max_updates=5], tests: [as_trained]}
+      two: {label: second, family: ours, seeds: 1, set: [max_updates=5], tests: [as_trained], after: one}
     figures:
       curve: {kind: curves, title: Curves, trainings: [one]}
       dots: {kind: seeds, title: Seeds, test: as_trained, trainings: [one, two]}
@@ -81,11 +82,31 @@ def test_more_seeds_are_given_up_to_those_of_the_study(tmp_path: Path) -> None:
     assert [(job.training, job.seed) for job in jobs if job.seed] == [("one", 1), ("one", 2)]
 
 
+def test_a_training_goes_on_with_an_earlier_one_of_its_seed_once_that_is_whole(
+    tmp_path: Path,
+) -> None:
+    config = StudyConfig(run_dir="x", study="game", budget="short", seeds=1)
+    one, two = jobs_of(config, read_studies(studies(tmp_path)))
+    assert (one.after, two.after) == (None, "one")
+    first = Work(one, tmp_path / "one", [], None)
+    then = Work(two, tmp_path / "two", ["as_trained"], first)
+    assert first.ready
+    assert not then.ready
+    (tmp_path / "one").mkdir()
+    (tmp_path / "two").mkdir()
+    (tmp_path / "one" / "result.json").write_text('{"ended_by": "max_updates"}')
+    assert then.ready
+    child = then.next()
+    assert child is not None
+    assert f"warm_start='{tmp_path / 'one'}'" in child.arguments
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
         ("family: ours, seeds", "family: theirs, seeds", "there is no family 'theirs'"),
         ("tests: [as_trained]", "tests: [gone]", "there is no test 'gone'"),
+        ("after: one", "after: two", "there is no earlier training 'two'"),
         ("title: A game", "titel: A game", "unknown field `titel`"),
     ],
 )

@@ -76,7 +76,7 @@ class _Room:
     def __init__(self, spec: EpisodeSpec, count: int, facts: bool) -> None:
         self.spec, self.episodes = spec, spec.empty(count)
         self.facts: dict[str, Array] | None = {} if facts else None
-        self.seconds, self.slowest = np.zeros(count), np.zeros(count)
+        self.seconds, self.slowest, self.chose = np.zeros((3, count))
         self.rows = slice(0, 0)
 
     def at(self, first: int, count: int) -> "_Room":
@@ -111,7 +111,8 @@ class _Room:
         """The first episodes."""
         facts = {name: one[:count] for name, one in (self.facts or {}).items()}
         first = slice(count)
-        return Played(self.episodes.at(first), facts, self.seconds[first], self.slowest[first])
+        times = self.seconds[first], self.slowest[first], self.chose[first]
+        return Played(self.episodes.at(first), facts, *times)
 
 
 def _play_group(
@@ -133,6 +134,7 @@ def _play_group(
         actions = choose(seen, room.history(t), generators)
         spent = time.process_time() - asked
         room.slowest[rows] = np.maximum(room.slowest[rows], spent)
+        room.chose[rows] += spent / env.count
         step = env.step(actions)
         episodes.actions[rows, t], episodes.rewards[rows, t] = actions, step.rewards
         episodes.terminated[rows, t], seen = step.terminated, step.seen
