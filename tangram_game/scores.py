@@ -111,7 +111,7 @@ def score_hidden(
         from tangram_game.figures.methods import together  # noqa: PLC0415
     except ImportError as error:
         raise _no_library(task, error) from error
-    hidden = hide(task, figures, seed, together(task.layout))
+    hidden = hide(task, figures, together(task.layout))
     laid = {name: play_hidden(hidden, player, seed, at_once) for name, player in players.items()}
     return _of_hidden({name: (hidden, own) for name, own in laid.items()})
 
@@ -133,7 +133,7 @@ def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
         raise _no_library(task, error) from error
     own, policy = learned_method(run), exact_policy(task.layout, task.sim)
     methods = {RUN: own, "largest first": replace(own, values=None), "search": UNLEARNED}
-    every = {name: hide(task, figures, seed, method) for name, method in methods.items()}
+    every = {name: hide(task, figures, method) for name, method in methods.items()}
     laid = {name: play_hidden(hidden, lambda _: policy, seed) for name, hidden in every.items()}
     return _of_hidden({name: (hidden, laid[name]) for name, hidden in every.items()})
 

@@ -26,7 +26,6 @@ from tangram_sim.motion.actions import (
     velocities,
 )
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
-from tangram_sim.sight.lens import Lens, View
 from tangram_sim.sight.perception import Eye, Sight
 from tangram_sim.targets.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world.world import check_shown, make_world
@@ -144,7 +143,6 @@ class BatchedEnv:
         self.goal_rows = goal_rows(layout, sim)
         self._ends_by_placing = layout.tokens > 1 or sim.actions_per_token == 1
         self._worlds = [make_world(layout, sim) for _ in range(count)]
-        self._lens = Lens(sim)
         observed = eye if sim.looks else None
         self.sight = None if observed is None else Sight(layout, observed, count, sim.arena)
         self._targets: TargetPictures | None = None
@@ -175,7 +173,7 @@ class BatchedEnv:
         self,
         generators: Sequence[np.random.Generator],
         targets: Sides | None = None,
-        views: Sequence[View] | None = None,
+        known: bool = False,
         starts: Starts | None = None,
     ) -> None:
         """Begin an episode in every environment: a new target and a new start.
@@ -183,8 +181,8 @@ class BatchedEnv:
         Args:
             generators: one per environment; all of the episode's randomness comes from it.
             targets: poses (B, K, 3) and sides (B, K) to assemble; None: they are drawn.
-            views: how targets that are given were seen before; then they are known as they were
-                seen, and in the camera's pictures only the tokens are looked for.
+            known: whether targets that are given were seen before; then in the camera's pictures
+                only the tokens are looked for.
             starts: where tokens lie, and which are placed already, but in pictures, where alike
                 tokens have no names; None: they are drawn, and none is placed.
 
@@ -200,7 +198,7 @@ class BatchedEnv:
             none = np.zeros((self.count, self.layout.tokens), np.bool_)
             starts = Starts(*sample_starts(self.layout, self.sim, targets, generators), none)
         self._generators = generators
-        self._begin(targets, starts, views)
+        self._begin(targets, starts, known)
         if self.sim.observe == "silhouette":
             self.seen_goals = self._outlined()
         elif self.sight is None:
@@ -277,28 +275,21 @@ class BatchedEnv:
         covered: Floats = common.sum(axis=1) / layout.areas[tokens]
         return covered
 
-    def _begin(self, targets: Sides, starts: Starts, known: Sequence[View] | None) -> None:
+    def _begin(self, targets: Sides, starts: Starts, known: bool) -> None:
         """Photograph the targets and put the tokens at their starts."""
         # World after world, here and in `_move`: the engine's memory of each fills the cache.
         pictures = []
-        views = self._lens.begin(self._generators) if known is None else self._lens.stand(known)
         for b, world in enumerate(self._worlds):
-            if self._lens.disturbs:
-                world.aim(views[b].x, views[b].y, views[b].turn)
             if self.sim.pixels:
                 world.place(targets[0][b], targets[1][b])
-                pictures.append(self._picture(b))
+                pictures.append(world.picture())
             world.place(starts.poses[b], starts.flipped[b])
         if self.sim.pixels:
-            self._targets = TargetPictures(np.stack(pictures), self._lens.disturbs)
+            self._targets = TargetPictures(np.stack(pictures))
         if self.sight is not None:
-            self.pictures = np.stack([self._picture(b) for b in range(self.count)])
-            goals = None if known is None else self.goals
+            self.pictures = np.stack([world.picture() for world in self._worlds])
+            goals = self.goals if known else None
             self.sight.begin(np.stack(pictures), self.pictures, goals)
-
-    def _picture(self, b: int) -> Pixels:
-        """(P, P) of an environment, as the camera has it now."""
-        return self._lens.taken(b, self._worlds[b].picture(), self._generators[b])
 
     def _move(self, tokens: Ints, velocity: Floats, flip: Bools, idle: Bools) -> Floats | None:
         """Move in every world; (B,) Eq. 14 of the pictures with the camera on."""
@@ -307,7 +298,7 @@ class BatchedEnv:
             if not idle[b]:
                 world.move(int(tokens[b]), velocity[b], bool(flip[b]))
             if self.sim.pixels:
-                pictures.append(self._picture(b))
+                pictures.append(world.picture())
         if self._targets is None:
             return None
         self.pictures = np.stack(pictures)

@@ -19,13 +19,13 @@ SILHOUETTES = ("silhouette", "silhouette_pictures")
 OBSERVED = ("corners", "pictures", *SILHOUETTES)
 LOOKED_AT = ("pictures", "silhouette_pictures")
 # The settings of the camera.
-CAMERA = ("pixels", "picture", "disturbance")
+CAMERA = ("pixels", "picture")
 NO_PICTURES: dict[str, object] = {"pixels": 0}
 MOTIONS = ("lift", "slide")
 # Share of a token that may come to lie on others where it is set down: the engine pushes such
 # tokens apart by a little, and with more it would move what is placed.
 MAX_OVERLAP = 0.2
-STARTS = ("anywhere", "outside", "piles")
+STARTS = ("anywhere", "outside")
 TARGETS = ("uniform", "connected", "figures", "touching")
 
 
@@ -62,7 +62,7 @@ class SimConfig(Settings, section="sim"):
     )
     starts: str = setting(
         "anywhere",
-        "in the arena; outside of the target where there is room; or so, in piles of 1 to 3 tokens",
+        "in the arena, or outside of the target where there is room",
         choices=STARTS,
     )
     mirrored: float = setting(
@@ -88,16 +88,6 @@ class SimConfig(Settings, section="sim"):
         choices=PICTURES,
         unless=NO_PICTURES,
     )
-    disturbance: float = setting(
-        0.0,
-        "strength of what disturbs the camera; at 1 each pixel has a noise of 8 of 255 levels, "
-        "pictures are blurred by 1 pixel, light falls off by a fifth across them, and the camera "
-        "is turned by 1 degree and shifted by 2 pixels, each way as each episode draws; targets "
-        "and tokens are seen by the same camera",
-        low=0,
-        high=1,
-        unless=NO_PICTURES,
-    )
 
     @property
     def looks(self) -> bool:
@@ -106,7 +96,7 @@ class SimConfig(Settings, section="sim"):
 
     @property
     def blind(self) -> "SimConfig":
-        """The same world without a camera, and so without what disturbs one."""
+        """The same world without a camera."""
         usual = {name: getattr(SimConfig, name) for name in (*CAMERA, "observe")}
         return replace(self, **usual)
 

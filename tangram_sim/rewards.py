@@ -72,20 +72,15 @@ def scaled_overlap(share: Floats) -> Floats:
 class TargetPictures:
     """Pictures (B, P, P) of the targets, as Eq. 14 compares others with them."""
 
-    def __init__(self, targets: Pixels, hidden: bool = False) -> None:
+    def __init__(self, targets: Pixels) -> None:
         """Count the pixels of each.
-
-        Args:
-            targets: the pictures.
-            hidden: whether a target may show in no pixel, as the camera is disturbed: then nothing
-                of it can be covered.
 
         Raises:
             ConfigError: a target covers no pixel.
         """
         self._wanted = token_pixels(targets)
         self._total = np.count_nonzero(self._wanted, axis=(1, 2))
-        if not (hidden or self._total.all()):
+        if not self._total.all():
             size = targets.shape[-1]
             raise ConfigError(
                 f"the target covers no pixel of a picture of {size} x {size}: raise "
@@ -95,7 +90,7 @@ class TargetPictures:
     def rewards(self, states: Pixels) -> Floats:
         """Eq. 14 (B,) of other pictures (B, P, P), from [0, 1] to [-1, 1]."""
         covered = np.count_nonzero(self._wanted & token_pixels(states), axis=(1, 2))
-        rewards: Floats = 2.0 * covered / np.maximum(self._total, 1) - 1.0
+        rewards: Floats = 2.0 * covered / self._total - 1.0
         return rewards
 
 

@@ -11,7 +11,6 @@ from tangram_core.arrays import Bools, Pixels, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Env, Generators, Purpose, Step
 from tangram_sim.batch import BatchedEnv, StepResult
-from tangram_sim.sight.lens import View
 from tangram_sim.sight.perception import Eye, Look
 from tangram_sim.targets.targets import Sides
 from tangram_sim.world.world import no_opencv
@@ -44,11 +43,11 @@ class PlaceEnv(Env):
         self,
         generators: Generators,
         targets: Sides | None = None,
-        views: list[View] | None = None,
+        known: bool = False,
     ) -> Arrays:
         """Begin an episode in every environment; see `BatchedEnv.reset`."""
         self._result = None
-        self.world.reset(generators, targets, views)
+        self.world.reset(generators, targets, known)
         return self._seen()
 
     def step(self, actions: Singles) -> Step:

@@ -123,7 +123,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.allow_flip": (SEVERAL, True),
     "sim.pixels": (CAMERA, 32),
     "sim.picture": (CAMERA, "grey"),
-    "sim.disturbance": (CAMERA, 1.0),
     "sim.observe": (SEEN, "pictures"),
     "reward.name": (ONE, "dense"),
     "reward.source": (SEEN, "camera"),
@@ -325,7 +324,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
         (ONE, "sim.picture", "grey", "sim.pixels=0"),
-        (ONE, "sim.disturbance", 1.0, "sim.pixels=0"),
         (over(ONE, sim={"observe": "silhouette"}), "sim.pixels", 64, "sim.observe=silhouette"),
     ],
 )

@@ -14,7 +14,7 @@ import numpy as np
 
 from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Floats, Ints
-from tangram_game.figures.puzzles import Figure, Player, figure_generator, play_figures
+from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_game.figures.silhouettes import SECONDS
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area
@@ -22,7 +22,6 @@ from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.motion.kinematics import wrap
-from tangram_sim.sight.lens import Lens, View
 from tangram_tasks.metrics import SOLVED, iou
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
@@ -70,13 +69,13 @@ class Hidden:
         task: the task, as a player of what was found sees it.
         figures: E, with the pieces that nobody is shown.
         searches: E.
-        views: E, how the camera saw them; None where outlines were shown.
+        pictured: whether pictures were shown, not outlines.
     """
 
     task: Place
     figures: tuple[Figure, ...]
     searches: tuple[Search, ...]
-    views: tuple[View, ...] | None
+    pictured: bool
 
     @property
     def filled_by(self) -> dict[str, int]:
@@ -134,22 +133,20 @@ class Laid:
     seconds: Floats
 
 
-def hide(task: Place, figures: Sequence[Figure], seed: int, method: Method = UNLEARNED) -> Hidden:
+def hide(task: Place, figures: Sequence[Figure], method: Method = UNLEARNED) -> Hidden:
     """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
 
     Args:
         task: with `sim.observe` one of `SILHOUETTES`.
         figures: E puzzles.
-        seed: of what disturbs the camera.
         method: how they are filled.
     """
     layout, sim, shown = task.layout, task.sim, tuple(figures)
     if sim.observe == "silhouette":
         searches = tuple(_outline_search(layout, figure, method) for figure in shown)
-        return Hidden(_seeing(task, "corners"), shown, searches, None)
-    seen = [_picture_search(layout, sim, figure, seed, method) for figure in shown]
-    searches, views = (tuple(column) for column in zip(*seen, strict=True))
-    return Hidden(_seeing(task, "pictures"), shown, searches, views)
+        return Hidden(_seeing(task, "corners"), shown, searches, pictured=False)
+    searches = tuple(_picture_search(layout, sim, figure, method) for figure in shown)
+    return Hidden(_seeing(task, "pictures"), shown, searches, pictured=True)
 
 
 def _seeing(task: Place, observe: str) -> Place:
@@ -165,18 +162,13 @@ def _outline_search(layout: Layout, figure: Figure, method: Method) -> Search:
     return _search(figure, filled, np.zeros(3))
 
 
-def _picture_search(
-    layout: Layout, sim: SimConfig, figure: Figure, seed: int, method: Method
-) -> tuple[Search, View]:
-    lens, generator = Lens(sim), figure_generator(figure, seed, "portrait")
-    (view,) = lens.begin([generator])
-    picture = lens.taken(0, portrait(_silhouette(layout, figure), sim, view), generator)
-    cover = coverage(picture)
+def _picture_search(layout: Layout, sim: SimConfig, figure: Figure, method: Method) -> Search:
+    cover = coverage(portrait(_silhouette(layout, figure), sim))
     if cover is None:  # nothing is to be seen
-        return Search(None, 0.0, 0.0, ""), view
+        return Search(None, 0.0, 0.0, "")
     corner = np.array([-sim.arena / 2.0, sim.arena / 2.0, 0.0])  # from which it is measured
     filled = fill_picture(cover, layout, sim.arena, SECONDS, method)
-    return _search(figure, filled, corner), view
+    return _search(figure, filled, corner)
 
 
 def _silhouette(layout: Layout, figure: Figure) -> Area:
@@ -212,5 +204,4 @@ def play_hidden(hidden: Hidden, player: Player, seed: int, at_once: int = AT_ONC
 def lay(hidden: Hidden, player: Player, seed: int, at_once: int = AT_ONCE) -> Played:
     """Lay what was found, F episodes; the targets are what was found, too."""
     laid = [search.laid for search in hidden.searches if search.laid is not None]
-    views = None if hidden.views is None else [hidden.views[e] for e in hidden.found]
-    return play_figures(hidden.task, laid, player, seed, views=views, at_once=at_once)
+    return play_figures(hidden.task, laid, player, seed, known=hidden.pictured, at_once=at_once)

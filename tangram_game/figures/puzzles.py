@@ -19,7 +19,6 @@ from tangram_core.task import Chooser, Env, Generators
 from tangram_sim.config import SILHOUETTES, RewardConfig
 from tangram_sim.puzzles.assembly import Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import SPLITS, library, read_puzzles
-from tangram_sim.sight.lens import View
 from tangram_sim.targets.targets import placement, turned_figure
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
@@ -87,7 +86,7 @@ def play_figures(
     player: Player,
     seed: int,
     touching: bool = True,
-    views: Sequence[View] | None = None,
+    known: bool = False,
     at_once: int = AT_ONCE,
 ) -> Played:
     """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
@@ -98,7 +97,7 @@ def play_figures(
         player: moves them.
         seed: of the starts.
         touching: whether their pieces touch, so that no picture tells them apart.
-        views: E, how they were seen before, in pictures that told their pieces.
+        known: whether they were seen before, in pictures that told their pieces.
         at_once: most that are played at a time.
 
     Raises:
@@ -106,7 +105,7 @@ def play_figures(
         SamplingError: the tokens find no room to start.
     """
     looks = task.sim.observe == "pictures"
-    if looks and touching and views is None:
+    if looks and touching and not known:
         raise ConfigError(
             "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
             "sim.observe=corners, or silhouette_pictures in tangram-eval"
@@ -121,8 +120,7 @@ def play_figures(
             return figure_generator(figures[number], seed)
 
         def begin(numbers: Ints, generators: Generators) -> Arrays:
-            seen = None if views is None else [views[i] for i in numbers.tolist()]
-            return env.reset(generators, (targets[0][numbers], targets[1][numbers]), seen)
+            return env.reset(generators, (targets[0][numbers], targets[1][numbers]), known)
 
         choose, count = player(env), len(figures)
         return Played.of(

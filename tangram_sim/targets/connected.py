@@ -12,7 +12,6 @@ from tangram_core.arrays import Bools, Complex, Floats, Ints
 from tangram_core.errors import SamplingError
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import outlines, pairs_overlap
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.targets.sampling import MAX_TRIES, check_fits
 
@@ -20,8 +19,6 @@ _CHUNK = 16  # candidates that are checked together
 _ALIGNED = 0.7  # share of pieces that meet another corner to corner
 _TOUCHING = 1e-9  # depth of an overlap, as a share of the arena: rounding
 MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
-_CLEAR_TRIES = 64  # of a pile outside of what is only to be avoided; then as often anywhere
-PILES_APART = 1.0 / 64.0  # as a share of the arena
 
 
 def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
@@ -36,64 +33,11 @@ def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -
     """
     check_fits(layout, sim)
     order = rng.permutation(layout.tokens)
-    return _laid_out(layout, order, _chained(layout, order, sim, rng), sim, rng)
-
-
-def sample_piles(
-    layout: Layout, sim: SimConfig, rng: np.random.Generator, avoid: Floats | None = None
-) -> Floats:
-    """One layout (K, 3) of piles of one to three tokens edge to edge, at least one of several.
-
-    The piles lie at least `PILES_APART` of the arena apart: two pixels of a picture of 128. No
-    token lies on its other side. Where there is room they keep clear of outlines (M, C, 2).
-
-    Raises:
-        SamplingError: a token does not fit into the arena, or no layout was found in `MAX_TRIES`
-            tries.
-    """
-    check_fits(layout, sim)
-    for _ in range(MAX_TRIES // _CLEAR_TRIES):  # each tries as often for every pile
-        poses = _piles(layout, sim, rng, avoid)
-        if poses is not None:
-            return poses
-    raise SamplingError(
-        f"no piles within an arena of width {sim.arena:g} in {MAX_TRIES} tries: raise sim.arena, "
-        "lower tokens.scale, or set sim.starts=anywhere"
-    )
-
-
-def _piles(
-    layout: Layout, sim: SimConfig, rng: np.random.Generator, avoid: Floats | None
-) -> Floats | None:
-    """One try to lay piles; None where one finds no room."""
-    order, parts = rng.permutation(layout.tokens), list[Ints]()
-    while len(parts) in (0, layout.tokens):  # at least one is of several
-        sizes = rng.integers(1, MAX_PILE + 1, layout.tokens)
-        parts = [part for part in np.split(order, np.cumsum(sizes)) if len(part)]
-    bodies, poses, before = _bodies(layout), np.zeros((layout.tokens, 3)), order[:0]
-    for own in parts:
-        for number in range(2 * _CLEAR_TRIES):
-            pile = _laid_out(layout, own, _chained(layout, own, sim, rng), sim, rng)
-            laid, new = bodies.of(before).at(poses[before]), bodies.of(own).at(pile[own])
-            if not _apart(new, laid, -PILES_APART * sim.arena).all():
-                continue
-            if avoid is None or number >= _CLEAR_TRIES or _clear(layout, pile, own, avoid):
-                break
-        else:
-            return None
-        poses[own], before = pile[own], np.concatenate([before, own])
-    return poses
-
-
-def _clear(layout: Layout, poses: Floats, own: Ints, avoid: Floats) -> bool:
-    """Whether tokens of their own (n,) in poses (K, 3) overlap none of the outlines (M, C, 2)."""
-    pieces = outlines(layout.corners(poses)[None], layout)[0, own]
-    every = np.repeat(pieces, len(avoid), axis=0), np.tile(avoid, (len(own), 1, 1))
-    return not pairs_overlap(*every).any()
+    return _laid_out(layout, _chained(layout, order, sim, rng), sim, rng)
 
 
 def _chained(layout: Layout, order: Ints, sim: SimConfig, rng: np.random.Generator) -> Floats:
-    """Poses (K, 3) in which each token of an order (n,) touches one before it; 0 of the others."""
+    """Poses (K, 3) in which each token of an order (K,) touches one before it."""
     bodies = _bodies(layout)
     turns, shifts = np.ones(layout.tokens, np.complex128), np.zeros(layout.tokens, np.complex128)
     for number, token in enumerate(order[1:], 1):
@@ -124,12 +68,6 @@ class _Outlines:
         return _Outlines(
             self.corners[which], self.edges[which], self.lengths[which], self.count[which]
         )
-
-    def at(self, poses: Floats) -> "_Outlines":
-        """The outlines in poses (..., 3)."""
-        turn: Complex = np.exp(1j * poses[..., 2:])
-        shift: Complex = poses[..., :1] + 1j * poses[..., 1:2]
-        return self.moved(turn, shift)
 
     def moved(self, turn: Complex, shift: Complex) -> "_Outlines":
         """The outlines turned by a complex number of length 1, then shifted."""
@@ -200,14 +138,12 @@ def _outside(pieces: _Outlines, others: _Outlines, depth: float) -> Bools:
     return np.asarray((inwards <= depth).all(axis=-1).any(axis=-1))
 
 
-def _laid_out(
-    layout: Layout, own: Ints, poses: Floats, sim: SimConfig, rng: np.random.Generator
-) -> Floats:
-    """The whole turned by any angle and moved to where all of its own tokens lie in the arena."""
+def _laid_out(layout: Layout, poses: Floats, sim: SimConfig, rng: np.random.Generator) -> Floats:
+    """The whole turned by any angle and moved to where all of its tokens lie in the arena."""
     turn = rng.uniform(-np.pi, np.pi)
     centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * turn)
     turned = np.column_stack([centres.real, centres.imag, poses[:, 2] + turn])
-    corners = layout.corners(turned)[np.isin(layout.token_of_corner, own)]
+    corners = layout.corners(turned)
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = sim.arena - (high - low)
     turned[:, :2] += room * rng.random(2) - sim.arena / 2.0 - low

@@ -21,7 +21,7 @@ from tangram_sim.geometry.shapes import Shape, mirror_image, tan, turn_onto
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.puzzles.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import library
-from tangram_sim.targets.connected import MAX_PILE, sample_connected, sample_piles
+from tangram_sim.targets.connected import MAX_PILE, sample_connected
 from tangram_sim.targets.sampling import Generators, sample_batch
 
 Sides = tuple[Floats, Bools]
@@ -60,28 +60,12 @@ def sample_starts(layout: Layout, sim: SimConfig, targets: Sides, generators: Ge
         SamplingError: no room.
     """
     flipped = targets[1]
-    if sim.starts == "piles":
-        return _piles(layout, sim, targets, generators)
     if sim.allow_flip:
         drawn = [rng.random(layout.tokens) < 0.5 for rng in generators]
         flipped = np.stack(drawn) & layout.chiral
     goals = layout.corners(*targets)
     avoid = outlines(goals, layout) if sim.starts == "outside" else None
     return sample_batch(layout, sim, generators, flipped, avoid), flipped
-
-
-def _piles(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
-    """Starts in piles, those with chiral tokens on their other side as a mirror shows them."""
-    starts, sides = [], np.zeros(layout.tokens, np.bool_)
-    flipped = np.asarray(targets[1].any(axis=1))
-    goals = outlines(layout.corners(*targets), layout)
-    for other_side, avoid, rng in zip(flipped.tolist(), goals, generators, strict=True):
-        mirrored = rng.random() < 0.5 if sim.allow_flip else other_side
-        # A mirror shows the target, too; its outlines then go round the other way.
-        kept = avoid[:, ::-1] * (1.0, -1.0) if mirrored else avoid
-        poses = sample_piles(layout, sim, rng, kept)
-        starts.append(layout.mirrored(poses, sides) if mirrored else (poses, sides))
-    return np.stack([poses for poses, _ in starts]), np.stack([own for _, own in starts])
 
 
 def check_targets(layout: Layout, sim: SimConfig) -> None:
@@ -98,8 +82,6 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         given, usual = f"sim.motion={sim.motion}", SimConfig.motion
         refuse_ignored(given, "one token", "take a set of several", usual)
     _check_thick(layout, sim)
-    if sim.starts == "piles" and layout.tokens == 1:
-        refuse_ignored("sim.starts=piles", "one token", "take a set of several")
     if sim.looks:
         _check_names(layout, sim.observe)
     if sim.observe == "pictures" and sim.targets != "uniform" and layout.tokens > MAX_PILE:

@@ -22,22 +22,16 @@ class Camera:
         self._pixels = pixels
         # TinyRenderer samples a pixel at its lower left corner, so the camera stands half a pixel
         # to the right and up: then a pixel shows its centre.
-        self._shift = arena / pixels / 2.0
-        self._height = _CAMERA_HEIGHT + top
-        self.aim(0.0, 0.0, 0.0)
+        shift, height = arena / pixels / 2.0, _CAMERA_HEIGHT + top
+        self._view = pybullet.computeViewMatrix(
+            (shift, shift, height), (shift, shift, 0.0), (0.0, 1.0, 0.0)
+        )
         self._projection = pybullet.computeProjectionMatrixFOV(
             math.degrees(2.0 * math.atan(arena / 2.0 / _CAMERA_HEIGHT)),
             1.0,
             _CAMERA_HEIGHT - _DEPTH,
             _CAMERA_HEIGHT + _DEPTH,
         )
-
-    def aim(self, x: float, y: float, turn: float) -> None:
-        """Look at a point (engine units), turned counter-clockwise (rad)."""
-        cos, sin = math.cos(turn), math.sin(turn)
-        x += self._shift * (cos - sin)
-        y += self._shift * (sin + cos)
-        self._view = pybullet.computeViewMatrix((x, y, self._height), (x, y, 0.0), (-sin, cos, 0.0))
 
     def picture(self) -> Pixels:
         """(P, P) grayscale, see `World.picture`."""

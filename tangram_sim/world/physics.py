@@ -104,10 +104,6 @@ class PhysicsWorld:
         """See `World.flipped`."""
         return self._flipped.copy()
 
-    def aim(self, x: float, y: float, turn: float) -> None:
-        """See `World.aim`."""
-        self._camera.aim(x * self._unit, y * self._unit, turn)
-
     def picture(self) -> Pixels:
         """See `World.picture`."""
         return averaged(self._camera.picture(), self._pixels)

@@ -46,9 +46,6 @@ class World(Protocol):
     def flipped(self) -> Bools:
         """(K,) which tokens lie on their other side."""
 
-    def aim(self, x: float, y: float, turn: float) -> None:
-        """Let the camera look at another point (arena units), turned (rad), from now on."""
-
     def picture(self) -> Pixels:
         """(P, P) grayscale picture of the tokens as they lie; see pictures.py."""
 

@@ -37,7 +37,9 @@ studies:
     seeds: 3
     trainings:
       one: {label: first, family: ours, tests: [as_trained, puzzles]}
-      two: {label: second, family: ours, seeds: 1, set: [max_updates=5], tests: [as_trained], after: one}
+      two:
+        {label: second, family: ours, seeds: 1, set: [max_updates=5], tests: [as_trained],
+         after: one}
     figures:
       curve: {kind: curves, title: Curves, trainings: [one]}
       dots: {kind: seeds, title: Seeds, test: as_trained, trainings: [one, two]}

@@ -119,8 +119,6 @@ def test_picture_reward() -> None:
     empty = np.full((1, 16, 16), BACKGROUND, dtype=np.uint8)
     with pytest.raises(ConfigError, match=r"no pixel of a picture of 16 x 16: raise sim\.pixels"):
         TargetPictures(empty)
-    # A camera that is disturbed may not show it: nothing of it is covered.
-    assert TargetPictures(empty, hidden=True).rewards(empty - 255)[0] == -1.0
 
 
 OWN = """

@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 
 from tangram_agent.base.relabelling import learnable
-from tangram_core.arrays import Singles
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
-from tangram_core.task import Generators
 from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.kinematics import KinematicWorld
-from tangram_sim.sight.lens import Disturbance
 from tests.agent.builders import Policy
 from worker.play.rollout import Rollout, exploring
 
@@ -81,11 +78,11 @@ def test_the_same_pictures_give_the_same_episodes(
 ) -> None:
     """Played again with the pictures of before, in a world that lies of poses and blocks."""
     task = setup(*shapes)
-    policy, take, tape = Policy(task), BatchedEnv._picture, list[Any]()
-    monkeypatch.setattr(BatchedEnv, "_picture", lambda *of: tape.append(take(*of)) or tape[-1])
+    policy, take, tape = Policy(task), KinematicWorld.picture, list[Any]()
+    monkeypatch.setattr(KinematicWorld, "picture", lambda *of: tape.append(take(*of)) or tape[-1])
     whole = played(task, policy)
     noise, shown = np.random.default_rng(9), iter(tape)
-    monkeypatch.setattr(BatchedEnv, "_picture", lambda *of: [take(*of), next(shown)][1])
+    monkeypatch.setattr(KinematicWorld, "picture", lambda *of: [take(*of), next(shown)][1])
     monkeypatch.setattr(BatchedEnv, "_covered", lambda env, *_: noise.uniform(0, 1, env.count))
     poses = KinematicWorld.poses
     lie = lambda world: poses(world) + noise.normal(0, 1, poses(world).shape)  # noqa: E731
@@ -126,33 +123,6 @@ def test_alike_tokens_are_moved_where_they_are_seen() -> None:
         assert sure.sum() >= 4
         np.testing.assert_allclose(moved[sure, 1], [[0.1, 0.0]] * sure.sum(), atol=0.02)
         np.testing.assert_allclose(moved[sure, 0], 0.0, atol=0.02)
-
-
-@pytest.mark.parametrize(
-    ("sim", "full"),
-    [
-        ({"disturbance": 1.0}, {"shift": 32.0}),
-        ({"disturbance": 1.0}, {"blur": 8.0}),
-    ],
-    ids=str,
-)
-def test_what_no_picture_shows_ends_no_worker(
-    sim: dict[str, Any], full: dict[str, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tangram_sim.sight.lens.FULL", Disturbance(**full))
-    task = setup("square", **sim)
-
-    def far(_seen: object, _past: object, generators: Generators) -> Singles:
-        """As far as an action can be told."""
-        drawn = [np.sign(one.uniform(-1.0, 1.0, 3)) for one in generators]
-        return np.stack(drawn).astype(np.float32)
-
-    with closing(task.task.make(4)) as env:
-        episodes = Rollout(env, task.spec, 0, "player", 0, 0).play(far, 24)
-    seen = episodes["goals_seen"]
-    assert not np.asarray(seen).all()
-    spec = task.spec
-    assert EpisodeBatch(1, 0, episodes).encode(spec)
 
 
 def test_what_is_missing_travels_and_is_not_learned_from() -> None:

@@ -161,5 +161,5 @@ def test_paths_are_seen_from_the_callers_folder(
 
 
 def test_what_is_laid_over_a_run_is_what_was_given() -> None:
-    given = {"sim": {"arena": None, "disturbance": 0.0}, "agent": {"reapply": None}, "seed": 3}
-    assert with_changes(given) == {"seed": 3, "changes": {"sim": {"disturbance": 0.0}}}
+    given = {"sim": {"arena": None, "mirrored": 0.0}, "agent": {"reapply": None}, "seed": 3}
+    assert with_changes(given) == {"seed": 3, "changes": {"sim": {"mirrored": 0.0}}}

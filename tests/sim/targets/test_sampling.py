@@ -10,7 +10,7 @@ from tangram_core.errors import SamplingError
 from tangram_core.seeding import episode_generator, evaluation_generators
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.targets.connected import MAX_PILE, PILES_APART, sample_connected, sample_piles
+from tangram_sim.targets.connected import sample_connected
 from tangram_sim.targets.sampling import sample_batch
 from tests.sim.builders import (
     LOPSIDED,
@@ -171,28 +171,6 @@ def test_many_pieces_meet_corner_to_corner() -> None:
     assert whole / 200 == pytest.approx(0.7, abs=0.12)
 
 
-@pytest.mark.parametrize("layout", [GAME, layout_of("square", "square"), layout_of(*TRIO)])
-def test_piles_are_of_one_to_three_that_share_an_edge(layout: Layout) -> None:
-    sim, sizes = SimConfig(arena=3.0), set()
-    for rng in evaluation_generators(20):
-        poses = sample_piles(layout, sim, rng)
-        own = pieces(layout, poses)
-        assert np.abs(layout.corners(poses)).max() <= 1.5 + 1e-12
-        assert largest_overlap(layout, poses) < 1e-8 * 9.0
-        grown = shapely.union_all([piece.buffer(1e-6) for piece in own])
-        piles = shapely.get_parts(grown)
-        for pile in piles:
-            inside = [piece for piece in own if pile.intersects(piece)]
-            sizes.add(len(inside))
-            for piece in inside[: len(inside) * (len(inside) > 1)]:
-                others = [shared_edge(piece, other, 1e-6) for other in inside if other is not piece]
-                assert max(others) > 1e-4
-        gaps = [one.distance(other) for one, other in itertools.combinations(piles, 2)]
-        assert min(gaps, default=1.0) > PILES_APART * 3.0 - 1e-5
-        assert len(piles) < layout.tokens
-    assert sizes == set(range(1 if layout.tokens > 2 else 2, min(MAX_PILE, layout.tokens) + 1))
-
-
 def test_no_room_is_told() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(SamplingError, match="does not fit into an arena of width 0.5"):
@@ -201,6 +179,3 @@ def test_no_room_is_told() -> None:
     with pytest.raises(SamplingError, match="no connected target .* 0.55 in 1000 tries: raise"):
         sample_connected(pair, sim, rng)
     sample_connected(pair, SimConfig(arena=0.85), rng)
-    eight = layout_of(*["square"] * 8, scale=1.0)
-    with pytest.raises(SamplingError, match="no piles within .* 1.1 in 1000 tries: raise sim"):
-        sample_piles(eight, SimConfig(arena=1.1), rng)

@@ -159,7 +159,6 @@ def test_touching_is_connected_and_figures_in_turns() -> None:
             {},
             "'square' must be at least 0.002 thick .* got 0.00177",
         ),
-        (layout_of("square"), {"starts": "piles"}, "piles changes nothing with one token: leave"),
     ],
 )
 def test_tasks_that_tokens_cannot_play(
@@ -179,12 +178,9 @@ def starts_of(sim: SimConfig, layout: Layout, count: int) -> tuple[np.ndarray, n
     return starts[0], overlap_area(corners, goals, layout)
 
 
-@pytest.mark.parametrize("starts", ["outside", "piles"])
 @pytest.mark.parametrize("kind", ["uniform", "connected", "figures"])
-def test_starts_keep_clear_of_the_target_where_there_is_room(kind: str, starts: str) -> None:
-    sim = SimConfig(
-        targets=kind, starts=starts, mirrored=0.5, arena=2.5 if starts == "piles" else 2.0
-    )
+def test_starts_keep_clear_of_the_target_where_there_is_room(kind: str) -> None:
+    sim = SimConfig(targets=kind, starts="outside", mirrored=0.5)
     assert starts_of(sim, GAME, 24)[1].max() < 1e-7
     assert starts_of(replace(sim, starts="anywhere"), GAME, 24)[1].max() > 0.01
 
@@ -194,21 +190,6 @@ def test_starts_lie_on_the_target_where_there_is_no_other_room() -> None:
     starts, on = starts_of(SimConfig(starts="outside", arena=1.6), layout, 12)
     assert on.min() > 0.0
     assert np.abs(layout.corners(starts)).max() <= 0.8
-
-
-@pytest.mark.parametrize("settings", [{}, {"mirrored": 1.0}, {"allow_flip": True}])
-def test_starts_in_piles_lie_on_any_side_that_can_be_played(settings: dict[str, Any]) -> None:
-    sim, generators = SimConfig(starts="piles", **settings), evaluation_generators(8)
-    targets = sample_targets(GAME, sim, generators)
-    poses, flipped = sample_starts(GAME, sim, targets, generators)
-    for pose, own in zip(poses, flipped, strict=True):
-        assert largest_overlap(GAME, pose, own) < 1e-8
-        together = shapely.union_all([piece.buffer(1e-6) for piece in pieces(GAME, pose, own)])
-        assert 3 <= len(shapely.get_parts(together)) < GAME.tokens
-    if sim.allow_flip:
-        assert 0 < flipped.sum() < flipped.size
-    else:
-        np.testing.assert_array_equal(flipped, targets[1])
 
 
 def test_given_targets_are_played() -> None:
