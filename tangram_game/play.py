@@ -17,6 +17,8 @@ from tangram_agent.runs import Run, load_changed
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_core.run.outcome import plural
+from tangram_core.scores import SHOWN as TOLD
+from tangram_core.scores import told
 from tangram_core.store.files import write_whole
 from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names
 from tangram_game.figures.photographs import draw_photograph, read_photograph
@@ -79,10 +81,11 @@ def _shown(run: Run, config: PlayConfig) -> str:
         FixedTests(task, count, run.actor.at_once, role="play", seed=config.seed)
     ) as tests:
         played = tests.play(greedy(run.actor))
+    line = f"{plural(count, 'episode')}, {told(task.scores[:TOLD], task.score(played))}"
     if kind == ".json":
         plan = json.dumps(task.plan(played), indent=1) + "\n"
         write_whole(Path(config.out), plan.encode())
-        return plural(count, "episode")
+        return line
     film = None if kind == ".png" else task.film(played)
     picture = task.draw(played) if film is None else None
     frames = [] if picture is None else [picture]
@@ -92,7 +95,7 @@ def _shown(run: Run, config: PlayConfig) -> str:
             f"tangram-eval run_dir={run.folder} scores it"
         )
     save_picture(config.out, [Image.fromarray(one) for one in film or frames])
-    return plural(count, "episode")
+    return line
 
 
 def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> Show:
@@ -161,11 +164,11 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     played = play_figures(task, [found.figure], by(run.actor), config.seed)
     width = WIDTH if _is_still(config.out) else WIDTH // 2
     seen = draw_silhouette(found, task.layout, width, bare=SHOWN * fills)
-    told = found.told
+    said = found.told
     if fills:
         solved = assembled(task.layout, played).iou[0] >= SOLVED
-        told = "filled by the run itself" if solved else f"not filled by the run itself, but {told}"
-    return Show(task, played, [found.figure.title], "silhouette", seen, told)
+        said = "filled by the run itself" if solved else f"not filled by the run itself, but {said}"
+    return Show(task, played, [found.figure.title], "silhouette", seen, said)
 
 
 def _beside(task: Place) -> Place:

@@ -26,6 +26,7 @@ CPU = torch.device("cpu")
 _THEN = 32  # pushes of each token that are looked at after one that is tried out
 _SURE = 4  # times as many pushes are looked at where nothing is tried out
 _SAME = 0.003  # a token that moves and turns less has not moved
+_STILL = 1e-4  # corners that are all nearer than this have not moved
 _AGAIN = 100.0  # cost of what has been before
 
 
@@ -64,7 +65,8 @@ class PushActor(NetworkActor):
         which = scene.which.gather(1, slots)
         if most > 1:
             options = tokens.actions[which.numpy(), found.numpy()]
-            at = self._tried(corners, goals, options, (values > NEVER).numpy(), past)[:, None]
+            possible = (values > NEVER).numpy() & ~_made_here(corners, options, past)
+            at = self._tried(corners, goals, options, possible, past)[:, None]
             which, found = which.gather(1, at), found.gather(1, at)
         chosen, pushes = (one[:, 0].numpy().copy() for one in (which, found))
         if explore is not None:
@@ -163,6 +165,14 @@ class PushActor(NetworkActor):
         drawn = [(one.integers(PUSHES, size=size), one.random(3)) for one in explore]
         pushes, numbers = (np.stack(part) for part in zip(*drawn, strict=True))
         return torch.from_numpy(pushes.reshape(count * each, -1)), numbers.astype(np.float32)
+
+
+def _made_here(corners: Array, actions: Floats, past: History) -> Bools:
+    """(B, M) which of pushes (B, M, 4) were made already where all lay as it does now (B, V, 2)."""
+    off = np.abs(past.seen["corners"][:, :-1] - corners[:, None])
+    same = np.isclose(past.actions[:, None], actions[:, :, None]).all(axis=-1)
+    made: Bools = (same & (off.max(axis=(2, 3)) < _STILL)[:, None]).any(axis=-1)
+    return made
 
 
 def _all_pushes(rows: int) -> torch.Tensor:

@@ -318,6 +318,19 @@ def test_what_has_been_before_is_not_sought_again(monkeypatch: pytest.MonkeyPatc
     assert actor._tried(corners, goals, actions, ~np.array([[True, False]]), past).tolist() == [1]
 
 
+def test_a_push_that_did_nothing_is_not_made_again() -> None:
+    actor = Pushing(replace(SMALL, tried=8)).actor(TWO)
+    actor.load(Pushing(SMALL).learner(TWO, 0, "cpu").broadcast())
+    with closing(TWO.make(1)) as env:
+        seen = env.reset(generators("test", 0, 1))
+    corners = seen["corners"][:, None]
+    first = actor.act(seen, now(seen["corners"]))
+    for moved, again in ((0.0, False), (0.5, True)):  # by what the push may have moved all
+        before = np.concatenate([corners - moved, corners], axis=1)
+        then = actor.act(seen, History({"corners": before}, first[:, None]))
+        assert np.array_equal(then, first) == again
+
+
 def test_no_more_pushes_are_tried_than_there_are() -> None:
     actor = Pushing(replace(SMALL, tried=1000)).actor(SQUARE)
     with closing(SQUARE.make(1)) as env:
