@@ -62,7 +62,7 @@ class Played:
         facts: what `Env.facts` told, (E, T + 1, ...): after reset and after each step.
         seconds: (E,) wall time of choosing and moving, an equal share for those played together.
         slowest: (E,) processor time of the slowest choice, in seconds.
-        chose: (E,) that of all choices, an equal share for those played together.
+        chose: (E,) that of all choices, shared equally by those played together that go on.
     """
 
     episodes: Episodes

@@ -50,6 +50,7 @@ _BESIDE = (
     Score("seconds_per_puzzle", "seconds"),
     Score("search_seconds", "of them the search"),
     Score("ms_per_decision", "ms for each action", 1),
+    Score("ms_per_choice", "CPU ms for each action", 1),
     Score("ms_slowest", "CPU ms of the slowest", 0),
 )
 
@@ -118,7 +119,7 @@ def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
     scores: Scores = {**task.score(whole), "episodes": float(whole.episodes.count)}
     if not isinstance(task, Place):
         ended = whole.episodes.terminated.cumsum(axis=1) - whole.episodes.terminated
-        return scores | {"ms_per_decision": 1e3 * float(whole.chose.sum() / (ended == 0).sum())}
+        return scores | {"ms_per_choice": 1e3 * float(whole.chose.sum() / (ended == 0).sum())}
     played = Played.of(whole)
     if task.outlines:
         return scores | of_outlines(task, played, at_once)

@@ -14,11 +14,10 @@ from PIL import Image, ImageDraw, ImageOps
 from rich.console import Console
 
 from tangram_agent.runs import Run, load_changed
+from tangram_core import scores
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_core.run.outcome import plural
-from tangram_core.scores import SHOWN as TOLD
-from tangram_core.scores import told
 from tangram_core.store.files import write_whole
 from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names
 from tangram_game.figures.photographs import draw_photograph, read_photograph
@@ -81,7 +80,8 @@ def _shown(run: Run, config: PlayConfig) -> str:
         FixedTests(task, count, run.actor.at_once, role="play", seed=config.seed)
     ) as tests:
         played = tests.play(greedy(run.actor))
-    line = f"{plural(count, 'episode')}, {told(task.scores[:TOLD], task.score(played))}"
+    shown = scores.told(task.scores[: scores.SHOWN], task.score(played))
+    line = f"{plural(count, 'episode')}, {shown}"
     if kind == ".json":
         plan = json.dumps(task.plan(played), indent=1) + "\n"
         write_whole(Path(config.out), plan.encode())
@@ -164,11 +164,11 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     played = play_figures(task, [found.figure], by(run.actor), config.seed)
     width = WIDTH if _is_still(config.out) else WIDTH // 2
     seen = draw_silhouette(found, task.layout, width, bare=SHOWN * fills)
-    said = found.told
+    told = found.told
     if fills:
         solved = assembled(task.layout, played).iou[0] >= SOLVED
-        said = "filled by the run itself" if solved else f"not filled by the run itself, but {said}"
-    return Show(task, played, [found.figure.title], "silhouette", seen, said)
+        told = "filled by the run itself" if solved else f"not filled by the run itself, but {told}"
+    return Show(task, played, [found.figure.title], "silhouette", seen, told)
 
 
 def _beside(task: Place) -> Place:

@@ -117,7 +117,7 @@ def play_figures(
     with closing(shown.make(min(at_once, len(figures)))) as env:
 
         def generator(number: int) -> np.random.Generator:
-            return figure_generator(figures[number], seed)
+            return _generator(figures[number], seed)
 
         def begin(numbers: Ints, generators: Generators) -> Arrays:
             return env.reset(generators, (targets[0][numbers], targets[1][numbers]), known)
@@ -128,9 +128,9 @@ def play_figures(
         )
 
 
-def figure_generator(figure: Figure, seed: int, what: str = "puzzle") -> np.random.Generator:
-    """A figure's own, whatever else is in its file; `what` it is for."""
-    return episode_generator(seed, f"{what} {figure.name}", 0, 0, round(figure.degrees * 1000))
+def _generator(figure: Figure, seed: int) -> np.random.Generator:
+    """A figure's own, whatever else is in its file."""
+    return episode_generator(seed, f"puzzle {figure.name}", 0, 0, round(figure.degrees * 1000))
 
 
 def _read(source: str | None, scale: float) -> tuple[Puzzle, ...]:

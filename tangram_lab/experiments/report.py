@@ -28,6 +28,7 @@ LABELS = {
     "angle_error_deg": "angle error, °",
     "position_error": "position error",
     "doubly_used": "doubly used",
+    "ms_per_choice": "CPU ms an action",
     "train_seconds": "training, s",
 }
 WHOLE = ("updates", "episodes", "parameters", "train_seconds")  # numbers without decimals

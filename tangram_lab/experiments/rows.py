@@ -33,7 +33,7 @@ SCORES = {
     "blocked": "blocked",
     "solved": "solved",
     "pushes": "pushes",
-    "ms_per_decision": "ms_per_decision",
+    "ms_per_choice": "ms_per_choice",
 }
 RUN = ("updates", "episodes", "parameters", "train_seconds")  # of the training
 LEVELS = {"reached_0.70": 0.70, "reached_0.75": 0.75}  # that the paper tells of

@@ -50,7 +50,7 @@ class Work:
     @property
     def ready(self) -> bool:
         """Whether nothing has to be trained before it."""
-        return self.first is None or self.first.trained
+        return self.first is None or self.first.trained or self.trained
 
     def scores(self, test: str) -> Path:
         """The file that a test leaves."""
@@ -93,7 +93,7 @@ class Work:
         for test in self.missing:
             scores = read_json(self.scores(test))
             rows += rows_of(job.training, job.label, job.seed, test, result, scores, curve)
-        if job.drawn:
+        if job.drawn and self.missing:
             points = curve_rows(job.training, job.seed, curve)
             append(folder / f"{study}_curves.csv", CURVE, points)
         append(folder / f"{study}.csv", COLUMNS, rows)
@@ -127,10 +127,11 @@ def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int
         run_dir = root / config.study / job.training / f"seed_{job.seed}"
         first = works[job.after, job.seed] if job.after else None
         works[job.training, job.seed] = Work(job, run_dir, missing, first)
-    firsts = [work.first for work in works.values() if work.missing]
-    wanted = [w for w in works.values() if w.missing or (w in firsts and not w.trained)]
-    for work in wanted:
-        work.check()
+    wanted = list[Work]()
+    for work in reversed(works.values()):  # whoever goes on with another comes after it
+        if work.missing or any(then.first is work and not then.trained for then in wanted):
+            work.check()
+            wanted.insert(0, work)
     console.print(f"{len(jobs) - len(wanted)} of {len(jobs)} runs are in {config.study}.csv")
     folder = RunFolder(root)
     folder.prepare("auto")
@@ -172,6 +173,9 @@ class Runner:
                 self._waiting.remove(work)
                 self._go_on(work)
             if not self._running:
+                for work in self._waiting if self._stop_s is None else ():
+                    self._failed.append(work)
+                    self._tell(work, "not begun, as the training before it failed")
                 return
             try:
                 self._take(self._events.get(timeout=LOOK_S))

@@ -39,7 +39,7 @@ class Training(msgspec.Struct, forbid_unknown_fields=True):
         family: what it has in common with others.
         tests: names of tests.
         set: what it alone is told.
-        seeds: how many, instead of the study's.
+        seeds: how many, instead of the study's; not more than those of `after`.
         after: an earlier training, whose agent of the same seed it goes on with.
     """
 
@@ -177,12 +177,15 @@ def jobs_of(config: StudyConfig, known: Studies) -> Iterator[Job]:
     check_choice("budget", config.budget, tuple(known.budgets))
     study, budget = known.studies[config.study], known.budgets[config.budget]
     most = config.seeds or budget.seeds
-    counts = {name: min(one.seeds or study.seeds, most) for name, one in study.trainings.items()}
+    counts = dict[str, int]()
+    for name, one in study.trainings.items():
+        most_here = counts[one.after] if one.after else most
+        counts[name] = min(one.seeds or study.seeds, most_here)
     curves = [one.trainings for one in study.figures.values() if one.kind == "curves"]
     drawn = {name for names in curves for name in names}
     for seed in range(max(counts.values())):
         for name, training in study.trainings.items():
-            if seed < min(counts[name], counts[training.after or name]):
+            if seed < counts[name]:
                 tests = {test: _test(known.tests[test], budget) for test in training.tests}
                 told = train_overrides(known, config.budget, training)
                 yield Job(name, training.label, seed, told, tests, name in drawn, training.after)

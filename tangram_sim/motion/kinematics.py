@@ -16,7 +16,6 @@ class KinematicWorld:
         self._sim = sim
         self._poses: Floats = np.zeros((layout.tokens, 3))
         self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
-        self._camera: Floats = np.zeros(3)
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""
@@ -38,16 +37,10 @@ class KinematicWorld:
         """See `World.flipped`."""
         return self._flipped.copy()
 
-    def aim(self, x: float, y: float, turn: float) -> None:
-        """See `World.aim`."""
-        self._camera[:] = x, y, turn
-
     def picture(self) -> Pixels:
         """See `World.picture`."""
-        corners = self._layout.corners(self._poses, self._flipped) - self._camera[:2]
-        cos, sin = np.cos(self._camera[2]), np.sin(self._camera[2])
-        shown = corners @ np.array([[cos, -sin], [sin, cos]])  # turned against the camera
-        taken = rasterise(shown, self._layout, self._sim.arena, taken_pixels(self._sim))
+        corners = self._layout.corners(self._poses, self._flipped)
+        taken = rasterise(corners, self._layout, self._sim.arena, taken_pixels(self._sim))
         return averaged(taken, self._sim.pixels)
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from tangram_core.errors import ConfigError, RunError
 from tangram_lab.experiments.report import write_report, write_runs
@@ -19,7 +20,7 @@ from tangram_lab.experiments.rows import (
     rows_of,
     spreads,
 )
-from tangram_lab.experiments.runner import Work
+from tangram_lab.experiments.runner import Work, run_study
 from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 from tests.test_docs import ROOT, unknown
 
@@ -101,6 +102,33 @@ def test_a_training_goes_on_with_an_earlier_one_of_its_seed_once_that_is_whole(
     child = then.next()
     assert child is not None
     assert f"warm_start='{tmp_path / 'one'}'" in child.arguments
+
+
+CHAIN = """      three: {label: third, family: ours, tests: [as_trained], after: two}
+      four: {label: fourth, family: ours, tests: [as_trained], after: three}
+    figures:
+"""
+
+
+def test_what_a_training_goes_on_with_is_trained_before_it_though_it_has_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = read_studies(studies(tmp_path, SMALL.replace("    figures:\n", CHAIN)))
+    config = StudyConfig(run_dir=str(tmp_path / "runs"), study="game", budget="short", out=".")
+    jobs = list(jobs_of(config, known))  # two has one seed, and so have those after it
+    assert [(job.training, job.seed) for job in jobs if job.seed] == [("one", 1)]
+    there = {("one", 0, test) for test in jobs[0].tests}
+    there |= {(job.training, 0, "as_trained") for job in jobs[1:3]} | {("one", 1, "as_trained")}
+    monkeypatch.setattr("tangram_lab.experiments.runner.done", lambda _: there)
+    begun = list[str]()
+    monkeypatch.setattr(Work, "next", lambda work: begun.append(work.job.name))
+    monkeypatch.setattr(Work, "write", lambda *_: "done")
+    console = Console(record=True, width=200)
+    assert run_study(config, jobs, console) == 1
+    assert begun == ["one, seed 0", "one, seed 1"]  # one is not whole, so nothing goes on with it
+    told = console.export_text()
+    for name in ("two", "three", "four"):
+        assert f"{name}, seed 0: not begun, as the training before it failed" in told
 
 
 @pytest.mark.parametrize(

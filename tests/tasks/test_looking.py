@@ -90,6 +90,8 @@ def test_the_same_pictures_give_the_same_episodes(
     other = played(task, policy)
     for name, column in whole.arrays.items():
         np.testing.assert_array_equal(column, other[name], err_msg=name)
+    assert tape
+    assert next(shown, None) is None
 
 
 def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:

@@ -130,11 +130,12 @@ def _play_group(
         if not go_on():
             return False
         room.look(seen, env, t)
+        going = ~episodes.terminated[rows, :t].any(axis=1)
         asked = time.process_time()
         actions = choose(seen, room.history(t), generators)
         spent = time.process_time() - asked
         room.slowest[rows] = np.maximum(room.slowest[rows], spent)
-        room.chose[rows] += spent / env.count
+        room.chose[rows] += spent * going / max(going.sum(), 1)
         step = env.step(actions)
         episodes.actions[rows, t], episodes.rewards[rows, t] = actions, step.rewards
         episodes.terminated[rows, t], seen = step.terminated, step.seen

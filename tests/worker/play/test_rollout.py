@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -147,6 +148,18 @@ def test_play_ends_before_an_action_when_it_is_told_to(asked: int, groups: int) 
         rollout = Rollout(env, made.spec, *IDENTITY)
         episodes = rollout.play(exploring(policy(made).actor), 5, lambda: next(answers))
     assert episodes.count == rollout.episode == 3 * groups
+
+
+def test_the_time_of_choices_is_that_of_those_who_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, clock = setup(PAIR), iter(range(100))  # a second for each choice
+    monkeypatch.setattr("worker.play.rollout.time.process_time", lambda: float(next(clock)))
+    with environment(made, 2) as env:
+        step = env.step
+        ended = np.array([True, False])
+        monkeypatch.setattr(env, "step", lambda one: replace(step(one), terminated=ended))
+        acting = exploring(policy(made).actor)
+        played = play(env, made.spec, acting, lambda i: episode_generator(*IDENTITY, i), 2)
+    assert played.chose.tolist() == [0.5, 1.5]
 
 
 def test_what_the_policy_sees_in_pictures_is_what_travels() -> None:
