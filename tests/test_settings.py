@@ -189,6 +189,7 @@ ELSEWHERE = {
     "task.id": "tests/tasks/test_gym.py: it is made, or refused by name",
     "task.imports": "tests/cluster/test_own_code.py: a module that is not there is named",
     "task.hand": "tests/tasks/test_push_shown.py: the arm pushes as the finger does",
+    "task.pixels": "tests/tasks/test_push.py: what pictures show is near",
     "task.ends": "tests/core/test_conformance.py: a toy without ends",
     "task.fresh": "tests/core/test_conformance.py: a toy made anew",
     "reward.sha256": "tests/sim/test_rewards.py: another file is refused",

@@ -70,12 +70,19 @@ class Sight:
         self.corners: Floats = layout.corners(self._poses)
         self.goals, self.goals_sure = self.corners, ~self.missing
 
-    def begin(self, targets: Pixels, states: Pixels, goals: Floats | None = None) -> None:
+    def begin(
+        self,
+        targets: Pixels,
+        states: Pixels,
+        goals: Floats | None = None,
+        named: Floats | float = 0.0,
+    ) -> None:
         """Look at pictures (B, P, P) of targets and starts, or of starts where goals are known.
 
-        Goals (B, V, 2) are as a look before has found them.
+        Goals (B, V, 2) are as a look before has found them; by poses `named` (B, K, 3), where they
+        are given, equal tokens are told apart.
         """
-        self._poses[:], self._flipped[:] = 0.0, False
+        self._poses[:], self._flipped[:] = named, False
         self.missing = np.ones_like(self.missing)
         count = len(self._poses)
         self.follow(states, np.zeros(count, np.int64), np.zeros((count, 3)))

@@ -18,6 +18,7 @@ from tangram_tasks.push.places import AWAY, begin, corners_of, push_of
 from tangram_tasks.push.trials import middle
 
 if TYPE_CHECKING:
+    from tangram_tasks.push.looking import Camera
     from tangram_tasks.push.task import Push
 
 
@@ -27,6 +28,7 @@ class PushEnv(Env):
     Attributes:
         refused: (B,) why the last push moved nothing, empty where it could.
         unknowns: (B,) what was drawn for the episode: for planners that are told.
+        corners, goals: (B, V, 2) of the tokens as they are, and of their places.
     """
 
     def __init__(self, task: "Push", count: int, fewer: Sequence[float] = ()) -> None:
@@ -38,6 +40,9 @@ class PushEnv(Env):
         shape = (count, task.layout.corner_count, 2)
         self.corners: Floats = np.full(shape, AWAY)
         self.goals: Floats = np.full(shape, AWAY)
+        self._cameras = [self._camera() for _ in range(count if task.config.pixels else 0)]
+        # As they are seen: pushes go by that.
+        self._shown = self.corners.copy() if self._cameras else self.corners
         self._present: Bools = np.zeros((count, task.layout.tokens), np.bool_)
         self.refused, self._ended = [""] * count, np.zeros(count, np.bool_)
         self.unknowns = [middle(task)] * count
@@ -60,6 +65,8 @@ class PushEnv(Env):
                 self.arms[b].home()
             self.goals[b] = corners_of(layout, desired, present)
             self.corners[b] = corners_of(layout, every, present)
+            if self._cameras:
+                self._shown[b] = self._cameras[b].begin(self.corners[b], present)
         self.refused, self._ended = [""] * self.count, np.zeros(self.count, np.bool_)
         return self._seen()
 
@@ -69,13 +76,15 @@ class PushEnv(Env):
         self.refused = [""] * self.count
         for b in np.flatnonzero(~self._ended).tolist():
             action = actions[b]
-            push = push_of(layout, self.corners[b], action, config.finger, config.longest)
+            push = push_of(layout, self._shown[b], action, config.finger, config.longest)
             self.refused[b] = push.refused or self._push(b, push.begin, push.way)
             if not self.refused[b]:
                 poses, there = self.tables[b].poses(), self._present[b]
                 self.corners[b] = corners_of(layout, poses, there)
+                if self._cameras:
+                    self._shown[b] = self._cameras[b].after(self.corners[b], push.token)
         # As the master has them, which comes to the same reward.
-        corners, goals = self.corners.astype(np.float32), self.goals.astype(np.float32)
+        corners, goals = self._shown.astype(np.float32), self.goals.astype(np.float32)
         placed = self._task.placed(corners, goals)
         rewards = self._task.paid(placed, self._present)
         self._ended = np.asarray(placed.all(axis=1))
@@ -126,4 +135,10 @@ class PushEnv(Env):
         )
 
     def _seen(self) -> Arrays:
-        return {"corners": self.corners.copy(), "goals": self.goals.copy()}
+        return {"corners": self._shown.copy(), "goals": self.goals.copy()}
+
+    def _camera(self) -> "Camera":
+        # Only here: most look at nothing, and its import takes time and memory.
+        from tangram_tasks.push.looking import Camera  # noqa: PLC0415
+
+        return Camera(self._task.layout, self._task.config.pixels)

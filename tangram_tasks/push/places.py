@@ -50,11 +50,13 @@ class Push:
     """Where the finger comes down, and its way.
 
     Attributes:
+        token: that is pushed.
         begin: (2,) of its centre.
         way: (2,) that it goes; it stays on the table.
         refused: why it cannot come down; nothing moves then. Empty: it can.
     """
 
+    token: int
     begin: Floats
     way: Floats
     refused: str = ""
@@ -67,14 +69,14 @@ def push_of(
     tokens, begins, ways = ways_of(layout, corners[None], np.asarray(action)[None], finger, longest)
     token, begin, way = int(tokens[0]), begins[0], ways[0]
     if not on_table(corners, layout)[token]:
-        return Push(begin, way, f"token {token} is not on the table")
+        return Push(token, begin, way, f"token {token} is not on the table")
     if not way.any():
-        return Push(begin, way, "the table ends there")
+        return Push(token, begin, way, "the table ends there")
     clear = apart(corners[layout.padded_corners] @ (1.0, 1j), begin @ (1.0, 1j))
     clear[token] = np.inf
     if clear.min() < finger:
-        return Push(begin, way, f"token {int(clear.argmin())} is in the way")
-    return Push(begin, way)
+        return Push(token, begin, way, f"token {int(clear.argmin())} is in the way")
+    return Push(token, begin, way)
 
 
 def ways_of(
@@ -144,7 +146,7 @@ def begin(
         SamplingError: no room.
     """
     tokens = np.sort(rng.permutation(layout.tokens)[:count])
-    own = _part(layout, tuple(tokens.tolist()))
+    own = part(layout, tuple(tokens.tolist()))
     kind = "touching" if has_all_tans(own) else "connected" if count > 1 else "uniform"
     sim = SimConfig(arena=ARENA, targets=kind)
     try:
@@ -188,5 +190,6 @@ def figures_of(layout: Layout, scale: float, named: Sequence[str]) -> Iterator[F
 
 
 @lru_cache(maxsize=256)
-def _part(layout: Layout, tokens: tuple[int, ...]) -> Layout:
+def part(layout: Layout, tokens: tuple[int, ...]) -> Layout:
+    """Some tokens of a set."""
     return Layout([layout.shapes[token] for token in tokens])

@@ -17,6 +17,7 @@ from tangram_core.scores import Score
 from tangram_core.settings import LEARNING, Settings, setting
 from tangram_core.spec import Array, EpisodeSpec, Field
 from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
+from tangram_sim.config import MIN_PIXELS
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
 from tangram_tasks.push.places import ARENA, begin, errors, figures_of, on_table
 
@@ -59,6 +60,12 @@ class PushConfig(Settings, section="task"):
         choices=("finger", "panda"),
     )
     longest: float = setting(0.5, "way of the longest push", low=0.05, high=2)
+    pixels: int = setting(
+        0,
+        "side of a grey picture from above in which tokens are found, from 16; 0: corners are known",
+        low=0,
+        high=1024,
+    )
     friction: str = setting(
         "drawn",
         "drawn: for each episode, from the ranges; fixed: the middle of the ranges, centres of "
@@ -87,6 +94,10 @@ class PushConfig(Settings, section="task"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if 0 < self.pixels < MIN_PIXELS:
+            raise ConfigError(
+                f"task.pixels must be 0 or at least {MIN_PIXELS}, got {self.pixels}: set it to 128"
+            )
         for name in ("table_friction", "spread", "finger_friction"):
             value = getattr(self, name)
             if len(value) != 2 or value[0] > value[1]:
@@ -192,6 +203,11 @@ class Push(Task):
         begin(self.layout, self.count, np.random.default_rng(0), self.figures)
         if plays and find_spec("pybullet") is None:
             raise ConfigError("task=push needs PyBullet, which is missing: pip install pybullet")
+        if plays and self.config.pixels and find_spec("cv2") is None:
+            raise ConfigError(
+                f"task.pixels={self.config.pixels} needs OpenCV, which is missing: pip install "
+                "opencv-python-headless, or set task.pixels=0"
+            )
 
     def make(self, count: int, purpose: Purpose = "play") -> Env:
         """So many tables in this process."""

@@ -20,7 +20,7 @@ from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
 from tangram_tasks.push.order import come_next
-from tangram_tasks.push.places import AWAY, corners_of, on_table, push_of
+from tangram_tasks.push.places import AWAY, corners_of, errors, on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
 from tangram_tasks.push.trials import middle
 
@@ -230,6 +230,7 @@ def test_it_learns_from_fewer_tokens_too_and_is_tested_with_all() -> None:
         ({"spread": (2.0, 1.0)}, "task.spread must be a range, got .2.0, 1.0.: write it as"),
         ({"finger_friction": (0.1,)}, "task.finger_friction must be a range"),
         ({"within": 0.0}, "task.within must be between"),
+        ({"pixels": 8}, "task.pixels must be 0 or at least 16, got 8: set it to 128"),
         ({"friction": "told"}, "task.friction must be one of drawn, fixed, got 'told'"),
     ],
 )
@@ -310,6 +311,18 @@ def test_what_is_beyond_the_action_space_is_cut() -> None:
         np.testing.assert_array_equal(
             env.step(far)[0]["observation"], other.step(cut)[0]["observation"]
         )
+
+
+def test_what_pictures_show_is_near_and_equal_tokens_keep_their_names() -> None:
+    equal = TokensConfig(("small_triangle", "small_triangle", "square"), 0.6)
+    task = Push(equal, PushConfig(pixels=128))
+    with closing(task.make(4)) as env:
+        seen, rng = env.reset(generators(4)), np.random.default_rng(3)
+        for share in (1.0, 0.8, 0.8):  # that is seen: of tokens that touch not always all
+            distance, turn = errors(task.layout, seen["corners"], env.facts()["corners"])
+            assert distance.min() > 0.0
+            assert ((distance < 0.003) & (turn < 0.02)).mean() >= share
+            seen = env.step(rng.uniform(-1.0, 1.0, (4, 4)).astype(np.float32)).seen
 
 
 def test_the_middle_of_a_row_comes_before_its_second_end() -> None:

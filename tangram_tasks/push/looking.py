@@ -1,0 +1,53 @@
+"""What a camera above a table shows: where its tokens lie.
+
+Legend: K tokens, V corners.
+"""
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.sight.perception import Look, Sight
+from tangram_sim.sight.pictures import averaged, rasterise, taken_pixels
+from tangram_tasks.push.places import ARENA, part
+from tangram_vision.pictures.seeing import see
+
+
+class Camera:
+    """Finds the tokens of one table in grey pictures from above."""
+
+    def __init__(self, layout: Layout, pixels: int) -> None:
+        self._layout = layout
+        self._sim = SimConfig(arena=ARENA, pixels=pixels, picture="grey")
+
+    def begin(self, corners: Floats, present: Bools) -> Floats:
+        """(V, 2) corners as they are seen of tokens (K,) that are on the table."""
+        self._tokens = np.flatnonzero(present)
+        self._rows = present[self._layout.token_of_corner]
+        self._part = own = part(self._layout, tuple(self._tokens.tolist()))
+
+        def look(picture: Pixels, _before: Look | None = None) -> Look:
+            return see(picture, own, ARENA)
+
+        self._sight = Sight(own, look, 1, ARENA)
+        picture = self._picture(corners)
+        own_corners = corners[None, self._rows]
+        self._sight.begin(picture, picture, own_corners, own.poses(own_corners))
+        return self._as_seen(corners)
+
+    def after(self, corners: Floats, pushed: int) -> Floats:
+        """(V, 2) the same, after a token was pushed; equal ones keep their names."""
+        moved = np.flatnonzero(self._tokens == pushed)
+        self._sight.follow(self._picture(corners), moved, np.zeros((1, 3)))
+        return self._as_seen(corners)
+
+    def _picture(self, corners: Floats) -> Pixels:
+        """(1, P, P)."""
+        taken = rasterise(corners[self._rows], self._part, ARENA, taken_pixels(self._sim))
+        return averaged(taken, self._sim.pixels)[None]
+
+    def _as_seen(self, corners: Floats) -> Floats:
+        seen = corners.copy()
+        seen[self._rows] = self._sight.corners[0]
+        return seen
