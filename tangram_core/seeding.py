@@ -4,8 +4,6 @@ import hashlib
 
 import numpy as np
 
-_TEST_SEED = 0
-
 
 def episode_generator(
     run_seed: int, role: str, index: int, incarnation: int, episode: int
@@ -26,11 +24,3 @@ def episode_generator(
     key = f"{run_seed}/{role!r}/{index}/{incarnation}/{episode}"
     digest = hashlib.sha256(key.encode()).digest()
     return np.random.default_rng(int.from_bytes(digest))
-
-
-def evaluation_generators(count: int) -> list[np.random.Generator]:
-    """The fixed test set: one generator per test, the same in every run.
-
-    The first tests of a larger set are those of a smaller one.
-    """
-    return [episode_generator(_TEST_SEED, "evaluation", 0, 0, i) for i in range(count)]

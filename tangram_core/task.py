@@ -61,14 +61,12 @@ class Played:
         episodes: as the agent saw them.
         facts: what `Env.facts` told, (E, T + 1, ...): after reset and after each step.
         seconds: (E,) wall time of choosing and moving, an equal share for those played together.
-        slowest: (E,) processor time of the slowest choice, in seconds.
-        chose: (E,) that of all choices, shared equally by those played together that go on.
+        chose: (E,) processor time of choosing, shared equally by those played together that go on.
     """
 
     episodes: Episodes
     facts: Arrays
     seconds: Floats = field(default_factory=lambda: np.zeros(0))
-    slowest: Floats = field(default_factory=lambda: np.zeros(0))
     chose: Floats = field(default_factory=lambda: np.zeros(0))
 
 

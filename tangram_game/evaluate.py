@@ -49,9 +49,7 @@ _BESIDE = (
     Score("share_solved_iou", "solved (IoU 0.95)"),
     Score("seconds_per_puzzle", "seconds"),
     Score("search_seconds", "of them the search"),
-    Score("ms_per_decision", "ms for each action", 1),
     Score("ms_per_choice", "CPU ms for each action", 1),
-    Score("ms_slowest", "CPU ms of the slowest", 0),
 )
 
 
@@ -111,10 +109,10 @@ def score_policies(
 ) -> dict[str, Scores]:
     """Scores of each policy, on the same episodes."""
     with closing(FixedTests(task, config.episodes, at_once, seed=config.seed)) as tests:
-        return {name: _scored(tests, player, at_once) for name, player in players.items()}
+        return {name: _scored(tests, player) for name, player in players.items()}
 
 
-def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
+def _scored(tests: FixedTests, player: Player) -> Scores:
     whole, task = tests.play(player(tests.env)), tests.task
     scores: Scores = {**task.score(whole), "episodes": float(whole.episodes.count)}
     if not isinstance(task, Place):
@@ -122,9 +120,9 @@ def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
         return scores | {"ms_per_choice": 1e3 * float(whole.chose.sum() / (ended == 0).sum())}
     played = Played.of(whole)
     if task.outlines:
-        return scores | of_outlines(task, played, at_once)
+        return scores | of_outlines(task, played)
     several = task.layout.tokens > 1
-    return scores | (of_several(played, at_once) if several else of_each(played))
+    return scores | (of_several(played) if several else of_each(played))
 
 
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:

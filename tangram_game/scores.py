@@ -64,7 +64,7 @@ def score_puzzles(
         name: play_figures(task, figures, player, seed, at_once=at_once)
         for name, player in players.items()
     }
-    scores = {name: _of_puzzles(task, own, at_once) for name, own in played.items()}
+    scores = {name: _of_puzzles(task, own) for name, own in played.items()}
     run, titles = played[RUN], [figure.title for figure in figures]
     told = "positions in arena units"
     if task.outlines:
@@ -72,17 +72,17 @@ def score_puzzles(
     return Scored(scores, _one_by_one(task, figures, run), titles, run.ends, run.goals, told)
 
 
-def _of_puzzles(task: Place, played: Played, at_once: int) -> Scores:
+def _of_puzzles(task: Place, played: Played) -> Scores:
     if task.outlines:
-        return of_outlines(task, played, at_once)
+        return of_outlines(task, played)
     own: Scores = {**summarise(task.layout, task.sim, played, own_reward=False)}
-    return own | {"episodes": float(len(played.overlap))} | of_several(played, at_once)
+    return own | {"episodes": float(len(played.overlap))} | of_several(played)
 
 
-def of_outlines(task: Place, played: Played, at_once: int) -> Scores:
+def of_outlines(task: Place, played: Played) -> Scores:
     """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
     found = assembled(task.layout, played)
-    return _of_areas(found) | {"episodes": float(len(found.iou))} | of_several(played, at_once)
+    return _of_areas(found) | {"episodes": float(len(found.iou))} | of_several(played)
 
 
 def _of_areas(found: "Assembled | Laid") -> Scores:
@@ -193,17 +193,13 @@ def of_each(played: Played) -> Scores:
     return {"coverage_each": np.round(played.overlap, 6).tolist()}
 
 
-def of_several(played: Played, at_once: int) -> Scores:
+def of_several(played: Played) -> Scores:
     """What only evaluations tell of several tokens: time, and every coverage."""
-    seconds = float(np.mean(played.seconds))
-    scores: Scores = {
-        "seconds_per_puzzle": seconds,
-        "ms_per_decision": 1e3 * seconds / played.refused.shape[1],
+    return {
+        "seconds_per_puzzle": float(np.mean(played.seconds)),
+        "ms_per_choice": 1e3 * float(np.mean(played.chose)) / played.refused.shape[1],
         **of_each(played),
     }
-    if at_once == 1:
-        scores["ms_slowest"] = 1e3 * float(played.slowest.max())
-    return scores
 
 
 def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:

@@ -37,7 +37,7 @@ class Played:
         blocked: (E, T) where a token could not be set down on others.
         seconds: (E,) wall time of choosing and moving, an equal share for each of those that were
             played together.
-        slowest: (E,) processor time of their slowest choice, in seconds.
+        chose: (E,) processor time of choosing.
         camera: (E,) Eq. 14 of the pictures after the last step; None without a camera.
         pictures: (E, T + 1, P, P) that were shown to the agent; None where it sees no pictures.
     """
@@ -49,7 +49,7 @@ class Played:
     refused: Bools
     blocked: Bools
     seconds: Floats
-    slowest: Floats
+    chose: Floats
     camera: Floats | None
     pictures: Pixels | None
 
@@ -75,7 +75,7 @@ class Played:
             refused=facts["refused"][:, 1:],
             blocked=facts["blocked"][:, 1:],
             seconds=played.seconds,
-            slowest=played.slowest,
+            chose=played.chose,
             camera=facts["camera"][:, -1] if "camera" in facts else None,
             pictures=facts.get("pictures"),
         )

@@ -170,7 +170,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "task.finger": (PUSH, 0.1),
     "task.puzzle": (PUSH_SEVEN, ["cat"]),
     "task.longest": (PUSH, 1.0),
-    "task.friction": (PUSH, "fixed"),
     "task.table_friction": (PUSH, [0.1, 0.2]),
     "task.spread": (PUSH, [4.0, 5.0]),
     "task.finger_friction": (PUSH, [1.0, 2.0]),

@@ -123,8 +123,6 @@ class PushEnv(Env):
         layout, config = self._task.layout, self._task.config
         tokens, own = layout.tokens, config.table_friction
         spread, finger = config.spread, config.finger_friction
-        if config.friction == "fixed":
-            return middle(self._task)
         angle, share = rng.uniform(-np.pi, np.pi, tokens), np.sqrt(rng.random(tokens))
         around = share[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return Unknowns(

@@ -62,15 +62,9 @@ class PushConfig(Settings, section="task"):
     longest: float = setting(0.5, "way of the longest push", low=0.05, high=2)
     pixels: int = setting(
         0,
-        "side of a grey picture from above in which tokens are found, from 16; 0: corners are known",
+        "side of a grey picture in which tokens are found, from 16; 0: their corners are known",
         low=0,
         high=1024,
-    )
-    friction: str = setting(
-        "drawn",
-        "drawn: for each episode, from the ranges; fixed: the middle of the ranges, centres of "
-        "mass in the middle",
-        choices=("drawn", "fixed"),
     )
     table_friction: tuple[float, ...] = setting(
         (0.5, 1.5),

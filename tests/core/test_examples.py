@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tangram_core.conformance import play
-from tangram_core.seeding import episode_generator, evaluation_generators
+from tangram_core.seeding import episode_generator
 from tests.core.examples import example
+from tests.sim.builders import evaluation_generators
 
 pytestmark = pytest.mark.slow
 

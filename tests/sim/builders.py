@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 
 from tangram_core.arrays import Floats
+from tangram_core.seeding import episode_generator
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
 from tangram_sim.targets.sampling import sample_batch
@@ -23,6 +24,11 @@ SEVEN = (
 TRIO = ("square", "small_triangle", "parallelogram")
 # Its centre of area is not the mean of its corners.
 LOPSIDED = {"name": "lopsided", "corners": [[0, 0], [4, 0], [3, 1], [0, 2]]}
+
+
+def evaluation_generators(count: int) -> list[np.random.Generator]:
+    """Those of the fixed test set: one for each test, the same in every run."""
+    return [episode_generator(0, "evaluation", 0, 0, i) for i in range(count)]
 
 
 def layout_of(*shapes: Any, scale: float = SQUARE_SCALE) -> Layout:

@@ -7,13 +7,12 @@ import pytest
 
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
-from tangram_core.seeding import evaluation_generators
 from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.env import TangramEnv
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens, velocities
-from tests.sim.builders import SEVEN, layout_of
+from tests.sim.builders import SEVEN, evaluation_generators, layout_of
 
 pytestmark = pytest.mark.fast
 

@@ -76,7 +76,7 @@ def ended(layout: Layout, corners: Floats, goals: Floats, **more: Any) -> Played
         "refused": np.zeros((count, steps), np.bool_),
         "blocked": np.zeros((count, steps), np.bool_),
         "seconds": np.ones(count),
-        "slowest": np.ones(count),
+        "chose": np.ones(count),
         "camera": None,
         "pictures": None,
     }

@@ -76,7 +76,7 @@ class _Room:
     def __init__(self, spec: EpisodeSpec, count: int, facts: bool) -> None:
         self.spec, self.episodes = spec, spec.empty(count)
         self.facts: dict[str, Array] | None = {} if facts else None
-        self.seconds, self.slowest, self.chose = np.zeros((3, count))
+        self.seconds, self.chose = np.zeros((2, count))
         self.rows = slice(0, 0)
 
     def at(self, first: int, count: int) -> "_Room":
@@ -111,8 +111,7 @@ class _Room:
         """The first episodes."""
         facts = {name: one[:count] for name, one in (self.facts or {}).items()}
         first = slice(count)
-        times = self.seconds[first], self.slowest[first], self.chose[first]
-        return Played(self.episodes.at(first), facts, *times)
+        return Played(self.episodes.at(first), facts, self.seconds[first], self.chose[first])
 
 
 def _play_group(
@@ -134,7 +133,6 @@ def _play_group(
         asked = time.process_time()
         actions = choose(seen, room.history(t), generators)
         spent = time.process_time() - asked
-        room.slowest[rows] = np.maximum(room.slowest[rows], spent)
         room.chose[rows] += spent * going / max(going.sum(), 1)
         step = env.step(actions)
         episodes.actions[rows, t], episodes.rewards[rows, t] = actions, step.rewards

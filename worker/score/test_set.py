@@ -11,7 +11,7 @@ class FixedTests:
     """Test episodes that are the same whoever plays them, `at_once` of them at a time.
 
     The first ones of a larger set are those of a smaller one. `role` and `seed` name the set; by
-    default it is that of `seeding.evaluation_generators`.
+    default it is the fixed one, the same in every run.
 
     Attributes:
         task: what is played.

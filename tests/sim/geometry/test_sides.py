@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tangram_core.arrays import Bools, Floats
-from tangram_core.seeding import evaluation_generators
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.overlap import overlap_share
@@ -17,7 +16,7 @@ from tangram_sim.geometry.shapes import SHAPE_NAMES, Shape, mirror_image, polygo
 from tangram_sim.motion.actions import action_size, flips
 from tangram_sim.sight.pictures import TOKEN_GRAY, rasterise
 from tangram_sim.world.world import World, make_world
-from tests.sim.builders import LOPSIDED, SEVEN, layout_of, random_poses
+from tests.sim.builders import LOPSIDED, SEVEN, evaluation_generators, layout_of, random_poses
 
 pytestmark = pytest.mark.fast
 

@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_core.seeding import evaluation_generators
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import full_scale
 from tangram_sim.targets.targets import check_targets
-from tests.sim.builders import TRIO, layout_of
+from tests.sim.builders import TRIO, evaluation_generators, layout_of
 
 pytestmark = pytest.mark.fast
 

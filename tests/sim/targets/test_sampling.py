@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from tangram_core.errors import SamplingError
-from tangram_core.seeding import episode_generator, evaluation_generators
+from tangram_core.seeding import episode_generator
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.connected import sample_connected
@@ -17,6 +17,7 @@ from tests.sim.builders import (
     SEVEN,
     SQUARE_SCALE,
     TRIO,
+    evaluation_generators,
     largest_overlap,
     layout_of,
     pieces,

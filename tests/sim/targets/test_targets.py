@@ -8,14 +8,20 @@ import pytest
 import shapely
 
 from tangram_core.errors import ConfigError
-from tangram_core.seeding import evaluation_generators
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import overlap_area
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.targets import check_targets, placement, sample_starts, sample_targets
-from tests.sim.builders import SEVEN, TRIO, largest_overlap, layout_of, pieces
+from tests.sim.builders import (
+    SEVEN,
+    TRIO,
+    evaluation_generators,
+    largest_overlap,
+    layout_of,
+    pieces,
+)
 
 pytestmark = pytest.mark.fast
 

@@ -8,13 +8,19 @@ import pybullet
 import pytest
 
 from tangram_core.arrays import Floats
-from tangram_core.seeding import evaluation_generators
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import corner_bound
 from tangram_sim.world.physics import PhysicsWorld
-from tests.sim.builders import SEVEN, angle_gap, largest_overlap, layout_of, sample_poses
+from tests.sim.builders import (
+    SEVEN,
+    angle_gap,
+    evaluation_generators,
+    largest_overlap,
+    layout_of,
+    sample_poses,
+)
 
 pytestmark = pytest.mark.fast
 

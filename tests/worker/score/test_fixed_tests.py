@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tangram_core.seeding import evaluation_generators
 from tangram_core.task import History
 from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import position_policy, random_policy
 from tests.agent.builders import PAIR, SQUARE, setup
+from tests.sim.builders import evaluation_generators
 from tests.worker.builders import policy
 from worker.play.rollout import greedy
 from worker.score.test_set import FixedTests
