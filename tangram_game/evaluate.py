@@ -54,12 +54,7 @@ _BESIDE = (
 
 
 def evaluate_run(config: EvalConfig) -> int:
-    """Score a run, print tables and write the scores.
-
-    Policies that learned nothing play the same episodes, to compare with: `exact` moves every
-    token exactly onto its target, `position only` one token onto its centre and never turns it,
-    `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order that pushes the
-    least out of place.
+    """Score a run and its task's rivals on the same episodes, print tables and write the scores.
 
     Returns:
         Exit status 0.

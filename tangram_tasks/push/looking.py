@@ -31,8 +31,7 @@ class Camera:
             return see(picture, own, ARENA)
 
         self._sight = Sight(own, look, 1, ARENA)
-        picture = self._picture(corners)
-        own_corners = corners[None, self._rows]
+        picture, own_corners = self._picture(corners), corners[None, self._rows]
         self._sight.begin(picture, picture, own_corners, own.poses(own_corners))
         return self._as_seen(corners)
 

@@ -10,6 +10,7 @@ Legend: N pushes of a shape, n of them, K tokens, V corners, C corners of a toke
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,7 +135,7 @@ class Planner:
         found = self._proposed(*scene, max(1, self._count), rng)
         tried = self._outcomes(*scene, knows, found)[:KEPT] if self._count else []
         if not tried:
-            return min(found, key=_cost)[1] if found else np.zeros(4)
+            return min(found, key=itemgetter(0))[1] if found else np.zeros(4)
         costs = list[float]()
         for left, _, there in tried:
             more = self._proposed(there, scene[1], NEXT, rng)
@@ -179,7 +180,7 @@ class Planner:
         self._trials.begin(corners, goals, knows)
         found = [(one, self._trials.after(one)) for _, one in pushes]
         left = [(self._left(at, goals), one, at) for one, at in found if at is not None]
-        return sorted(left, key=lambda one: one[0])
+        return sorted(left, key=itemgetter(0))
 
     def _left(self, corners: Floats, goals: Floats) -> float:
         """What is left of all tokens: the least pushes first."""
@@ -242,7 +243,3 @@ class Planner:
         for outline in outlines:
             clear &= apart(outline @ (1.0, 1j), begin) >= self._task.config.finger
         return clear
-
-
-def _cost(found: tuple[float, Floats]) -> float:
-    return found[0]
