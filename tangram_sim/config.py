@@ -20,7 +20,6 @@ OBSERVED = ("corners", "pictures", *SILHOUETTES)
 LOOKED_AT = ("pictures", "silhouette_pictures")
 # The settings of the camera.
 CAMERA = ("pixels", "picture")
-NO_PICTURES: dict[str, object] = {"pixels": 0}
 MOTIONS = ("lift", "slide")
 # Share of a token that may come to lie on others where it is set down: the engine pushes such
 # tokens apart by a little, and with more it would move what is placed.
@@ -86,7 +85,7 @@ class SimConfig(Settings, section="sim"):
         "what the camera takes: binary shows at each pixel what is at its centre; grey is averaged "
         "from a larger picture, as a real camera does",
         choices=PICTURES,
-        unless=NO_PICTURES,
+        unless={"pixels": 0},
     )
 
     @property

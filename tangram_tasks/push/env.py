@@ -18,7 +18,6 @@ from tangram_tasks.push.places import AWAY, begin, corners_of, push_of
 from tangram_tasks.push.trials import middle
 
 if TYPE_CHECKING:
-    from tangram_tasks.push.looking import Camera
     from tangram_tasks.push.task import Push
 
 
@@ -40,7 +39,11 @@ class PushEnv(Env):
         shape = (count, task.layout.corner_count, 2)
         self.corners: Floats = np.full(shape, AWAY)
         self.goals: Floats = np.full(shape, AWAY)
-        self._cameras = [self._camera() for _ in range(count if task.config.pixels else 0)]
+        self._cameras = []
+        if task.config.pixels:  # else not even imported: that takes time and memory
+            from tangram_tasks.push.looking import Camera  # noqa: PLC0415
+
+            self._cameras = [Camera(task.layout, task.config.pixels) for _ in range(count)]
         # As they are seen: pushes go by that.
         self._shown = self.corners.copy() if self._cameras else self.corners
         self._present: Bools = np.zeros((count, task.layout.tokens), np.bool_)
@@ -134,9 +137,3 @@ class PushEnv(Env):
 
     def _seen(self) -> Arrays:
         return {"corners": self._shown.copy(), "goals": self.goals.copy()}
-
-    def _camera(self) -> "Camera":
-        # Only here: most look at nothing, and its import takes time and memory.
-        from tangram_tasks.push.looking import Camera  # noqa: PLC0415
-
-        return Camera(self._task.layout, self._task.config.pixels)
