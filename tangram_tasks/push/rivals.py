@@ -123,10 +123,8 @@ class Planner:
     def _known(self, table: int) -> Unknowns:
         if self._knows == "all":
             return self._env.unknowns[table]
-        own = self._middle
-        if self._knows == "middle":
-            return own
-        return replace(own, spread=own.spread * WRONG, finger=own.finger * WRONG)
+        own, times = self._middle, WRONG if self._knows == "wrong" else 1.0
+        return replace(own, spread=own.spread * times, finger=own.finger * times)
 
     def _best(
         self, corners: Floats, goals: Floats, knows: Unknowns, rng: np.random.Generator
