@@ -2,6 +2,8 @@
 
 import json
 from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,16 @@ from rich.console import Console
 
 from tangram_core.errors import ConfigError, RunError
 from tangram_game.config import EvalConfig, PlayConfig
-from tangram_game.evaluate import evaluate_run, scores_table
+from tangram_game.evaluate import evaluate_run, score_policies, scores_table
 from tangram_game.play import play_run
 from tangram_game.scores import RUN
+from tangram_sim.geometry.layout import TokensConfig
 from tangram_tasks.place import ONE_TOKEN
+from tangram_tasks.push.task import Push, PushConfig
 from tests.agent.builders import PAIR, SQUARE
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 from tests.worker.builders import write_run
+from worker.score.test_set import FixedTests
 
 pytestmark = pytest.mark.fast
 
@@ -42,6 +47,19 @@ def evaluated(folder: Path, tokens: dict[str, Any] = GAME, **settings: Any) -> d
     assert evaluate_run(EvalConfig(str(folder / "run"), out=str(out), **settings)) == 0
     report: dict[str, Any] = json.loads(out.read_text())
     return report
+
+
+def test_the_time_of_an_action_is_that_of_those_who_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = Push(TokensConfig(("square",), 0.8), PushConfig())
+    random = task.rivals()["random"]
+    with closing(FixedTests(task, 2, 2)) as tests:
+        played = tests.play(random(tests.env))
+    played.episodes.terminated[:] = 0
+    played.episodes.terminated[0, 2:] = 1  # its last action is the third
+    timed = replace(played, chose=np.array([1.0, 2.0]))
+    monkeypatch.setattr(FixedTests, "play", lambda *_: timed)
+    scores = score_policies(task, {"random": random}, EvalConfig("run", episodes=2))
+    assert scores["random"]["ms_per_choice"] == pytest.approx(3000.0 / (3 + 8))
 
 
 # One token
