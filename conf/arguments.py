@@ -87,8 +87,8 @@ def _check_override(override: str, over: Sequence[str]) -> None:
         raise ConfigError(f"'{override}': no setting is taken away, write {name}=value instead")
     if name in over:
         raise ConfigError(
-            f"{override} chooses a preset, and a trained run has its own {name}: set single "
-            f"values, as --help {name} lists them"
+            f"{override} chooses a preset, and a trained run has its own {name}: name another run, "
+            f"as run_dir=pretrained/hand, or set single values, as --help {name} lists them"
         )
     if name in GROUPS and value.startswith("["):
         remedy = f"; for several tokens write tokens.shapes={value}" if name == "tokens" else ""

@@ -442,6 +442,7 @@ def _unknown_setting(name: str, known: Sequence[str]) -> str:
     same_ending = [key for key in known if key.rpartition(".")[2] == name]
     close = same_ending or difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean '{close[0]}'?" if close else "--help and --cfg job list them"
+    hint = "a trained run keeps its own" if name in GROUPS else hint
     return f"unknown setting '{name}' ({hint})"
 
 

@@ -65,7 +65,7 @@ def kinds_of(
 
 def with_usual_agent(arguments: Sequence[str], folder: str | None = None) -> list[str]:
     """The arguments of a new run; where they name a task and no agent, the one that it names."""
-    given = {argument.lstrip("+").partition("=")[0] for argument in arguments}
+    given = {one.lstrip("+").partition("=")[0] for one in arguments if "=" in one}
     task = _chosen(TASK, arguments, folder, None)
     if task in (None, Kinds().task) or given & {AGENT, f"{AGENT}.{KIND}", "from_config"}:
         return [*arguments]

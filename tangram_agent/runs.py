@@ -89,7 +89,8 @@ class Run:
         """
         if not isinstance(self.setup.task, Place):
             raise ConfigError(
-                f"{self.folder} plays task={self.setup.task_kind}, not tokens: name another run"
+                f"{self.folder} plays task={self.setup.task_kind}: ask it by act, as "
+                "docs/inference.md has it, or name a run of task=place"
             )
         return self.setup.task
 

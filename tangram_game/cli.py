@@ -57,7 +57,10 @@ def _play(settings: Plain) -> int:
     stored = _check_played(config)
     if Path(config.out).suffix == PLAN and type(stored.setup.task).plan is Task.plan:
         kind = stored.setup.task_kind
-        raise ConfigError(f"out={config.out}: task={kind} makes no plan, set out=play.gif")
+        raise ConfigError(
+            f"out={config.out}: task={kind} makes no plan: set out=play.gif, or "
+            "run_dir=pretrained/hand, which does"
+        )
     if config.target is not None:
         from tangram_game.figures.photographs import read_photograph
 
@@ -93,8 +96,8 @@ def _with_figures(settings: Plain) -> Plain:
         return settings
     if settings.get("sheet") or settings["turns"] != 1 or Path(puzzle[0]).suffix:
         raise ConfigError(
-            "task=push makes figures of the library, at an angle of each episode: leave turns "
-            "and sheet out, and set puzzle=cat"
+            "task=push makes figures of the library, at an angle of each episode: give the name "
+            "of one alone, as in puzzle=cat, without turns, sheet or file"
         )
     own = changes.get("task", {}) | {"puzzle": list(puzzle)}
     return settings | {"puzzle": None, "changes": changes | {"task": own}}

@@ -205,7 +205,7 @@ class PlayConfig(Settings):
         if Path(self.out).suffix not in WRITTEN:
             raise ConfigError(
                 f"out must end with {', '.join(WRITTEN)}, got '{self.out}': .gif and .mp4 move, "
-                ".png shows the ends"
+                ".png shows the ends, .json has a finger's way points"
             )
         if Path(self.out).suffix == ".mp4" and find_spec("av") is None:
             raise ConfigError(

@@ -2,7 +2,8 @@
 
 Tokens are carried by one agent, or pushed by a finger, which another one leads.
 
-Nothing is kept between two moves but what is given, so a page may change the scene at any time.
+Nothing is kept between two moves but what is given, and the pushes of the last round: a page may
+change the scene at any time.
 "Placed" is what lies in its piece: what was dragged or pushed away is moved again.
 
 Legend: K tokens, F frames.
@@ -17,7 +18,8 @@ import numpy as np
 import torch
 
 from tangram_agent.runs import Run, load_changed, load_run
-from tangram_core.arrays import Bools, Floats
+from tangram_core.arrays import Bools, Floats, Singles
+from tangram_core.task import History
 from tangram_sim.batch import BatchedEnv, Starts
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.overlap import overlap_share
@@ -91,11 +93,13 @@ class _Finger:
             self._unknowns = env.unknowns[0]
         self._table = PushTable(self._task.layout, self._task.config.finger)
         self.most = self._task.spec.horizon
+        self._made = list[tuple[Floats, Singles]]()  # corners before each push of a round, and it
 
-    def push(self, scene: Sides, goal: Sides) -> tuple[int, Floats, Floats] | None:
+    def push(self, scene: Sides, goal: Sides, made: int) -> tuple[int, Floats, Floats] | None:
         """Which token, frames (F, K, 3), and the finger's places (F, 2).
 
-        None where all lie in their places, or the finger cannot come down.
+        None where all lie in their places, or the finger cannot come down. The pushes that were
+        made in this round are known, so none that did nothing is made again.
 
         No push turns a token over: with one that lies on its other side, all is done in a mirror.
         """
@@ -107,7 +111,11 @@ class _Finger:
         if self._task.placed(corners[None], goals[None]).all():
             return None
         seen = {"corners": corners[None], "goals": goals[None]}
-        action = self._run.act(seen)
+        del self._made[made:]
+        moments = np.stack([*(before for before, _ in self._made), corners])[None]
+        actions = np.reshape([one for _, one in self._made], (1, -1, 4)).astype(np.float32)
+        action = self._run.act(seen, History({"corners": moments}, actions))
+        self._made.append((corners, action[0]))
         push = push_of(layout, corners, action[0], config.finger, config.longest)
         if push.refused:
             return None
@@ -182,7 +190,7 @@ def _carry(scene: Sides, goal: Sides, done: tuple[int, ...]) -> Move:
 
 def _push(scene: Sides, goal: Sides, done: tuple[int, ...]) -> Move:
     own = finger()
-    found = own.push(scene, goal) if len(done) < own.most else None
+    found = own.push(scene, goal, len(done)) if len(done) < own.most else None
     if found is None:
         return Move(None, scene.poses[None], False, *_scores(scene, goal), done, ended=True)
     token, frames, path = found

@@ -14,7 +14,7 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Ints, Pixels
 from tangram_core.errors import ConfigError
 from tangram_core.scores import Score
-from tangram_core.settings import LEARNING, Settings, setting
+from tangram_core.settings import LEARNING, Settings, setting, told
 from tangram_core.spec import Array, EpisodeSpec, Field
 from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
 from tangram_sim.config import MIN_PIXELS
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 PER_TOKEN = 8  # pushes that an episode has for each token
 FURTHEST = 8.0  # of a corner: only what is wrong lies beyond
 PICTURES, PIXELS = 12, 216
+DRAWS = 8  # layouts that must find room before a run begins
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,10 @@ class PushConfig(Settings, section="task"):
         for name in ("table_friction", "spread", "finger_friction"):
             value = getattr(self, name)
             if len(value) != 2 or value[0] > value[1]:
+                low, high = min(value, default=0.5), max(value, default=0.5)
                 raise ConfigError(
-                    f"task.{name} must be a range, got {[*value]}: write it as [0.5,1.5]"
+                    f"task.{name} must be a range, the lower end first, got {told(value)}: write "
+                    f"it as [{low:g},{high:g}]"
                 )
 
 
@@ -112,8 +115,8 @@ class Push(Task):
     agent: ClassVar[str] = "push"
     sections: ClassVar = {"tokens": TokensConfig, "task": PushConfig}
     scores: ClassVar = (
-        Score("solved", "all in place, share"),
-        Score("placed", "tokens in place, share"),
+        Score("solved", "all in place"),
+        Score("placed", "tokens in place"),
         Score("coverage", "covered"),
         Score("pushes", "pushes", digits=1),
         Score("refused", "pushes refused", digits=2),
@@ -125,8 +128,8 @@ class Push(Task):
         """Refuse more tokens than there are."""
         if self.config.count > self.layout.tokens:
             raise ConfigError(
-                f"task.count={self.config.count} of {self.layout.tokens} tokens: set it to at most "
-                f"{self.layout.tokens}, or take a larger set, as in tokens=tangram7"
+                f"task.count={self.config.count}, and there are {self.layout.tokens} tokens: set "
+                f"it to at most {self.layout.tokens}, or choose more tokens"
             )
 
     @cached_property
@@ -191,10 +194,11 @@ class Push(Task):
         fewer = self.config.fewer
         if fewer and (len(fewer) > self.count or not sum(fewer)):
             raise ConfigError(
-                f"task.fewer={[*fewer]} must have a weight above 0, and at most one for each of "
-                f"{self.count} tokens: write it as [0,1,1] for two tokens and three, as often"
+                f"task.fewer={told(fewer)} must have at most {self.count} weights, of 1, 2, ... "
+                f"tokens, and one above 0: write it as {told((1,) * self.count)}"
             )
-        begin(self.layout, self.count, np.random.default_rng(0), self.figures)
+        for seed in range(DRAWS):
+            begin(self.layout, self.count, np.random.default_rng(seed), self.figures)
         if plays and find_spec("pybullet") is None:
             raise ConfigError("task=push needs PyBullet, which is missing: pip install pybullet")
         if plays and self.config.pixels and find_spec("cv2") is None:

@@ -74,6 +74,17 @@ def test_a_push_is_shown_in_parts_with_the_finger_beside_its_token(name: str) ->
         assert len(done) == number + 1
 
 
+def test_a_push_that_did_nothing_is_not_made_again_in_its_round() -> None:
+    goal = figure("cat")
+    scene = Sides(begin(goal, 0), goal.flipped)
+    first = next_move(scene, goal, "push", ())
+    again, anew = (next_move(scene, goal, "push", done).finger for done in (first.done, ()))
+    np.testing.assert_array_equal(anew, first.finger)
+    assert again is not None
+    assert first.finger is not None
+    assert not np.allclose(again, first.finger, atol=1e-3)
+
+
 def test_pushing_ends_after_as_many_pushes_as_an_episode_has() -> None:
     goal = figure("cat")
     scene = Sides(begin(goal, 1), goal.flipped)

@@ -207,7 +207,9 @@ def test_one_of_two_tokens_is_half_of_the_reward() -> None:
 
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.0,)])
 def test_weights_of_no_tokens_are_refused_where_it_learns(weights: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match="task.fewer=.* must have a weight above 0, and at most"):
+    with pytest.raises(
+        ConfigError, match="task.fewer=.* must have at most 1 weights, of 1, 2, ... tokens, and one"
+    ):
         replace(SQUARE, config=PushConfig(fewer=weights)).check(plays=True)
 
 
@@ -222,8 +224,11 @@ def test_it_learns_from_fewer_tokens_too_and_is_tested_with_all() -> None:
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"count": 2}, "task.count=2 of 1 tokens: set it to at most 1, or take a larger set"),
-        ({"spread": (2.0, 1.0)}, "task.spread must be a range, got .2.0, 1.0.: write it as"),
+        ({"count": 2}, "task.count=2, and there are 1 tokens: set it to at most 1, or choose"),
+        (
+            {"spread": (2.0, 1.0)},
+            "task.spread must be a range, the lower end first, got .2,1.: write it as .1,2.",
+        ),
         ({"finger_friction": (0.1,)}, "task.finger_friction must be a range"),
         ({"within": 0.0}, "task.within must be between"),
         ({"pixels": 8}, "task.pixels must be 0 or at least 16, got 8: set it to 128"),

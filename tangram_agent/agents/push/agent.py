@@ -18,8 +18,8 @@ class PushingConfig(EpisodeConfig, section="agent"):
     width: int = setting(128, "width of all layers", low=8, high=4096, part=NETWORK)
     looked_at: int = setting(
         96,
-        "pushes of each token that the critic values before one is played; four times as many "
-        "where nothing is tried out",
+        "pushes of each token that the critic values before one is played while it learns; four "
+        "times as many are later",
         low=2,
         high=1024,
     )
