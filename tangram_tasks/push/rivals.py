@@ -1,92 +1,40 @@
 """Who plays without learning: by pushes of each shape tried alone, and by trials in an engine.
 
-What a push does to a token that lies alone is written down in the token's own frame, at the middle
-of what is unknown. A decision looks for the push, or the two pushes, after which least is left to
-go, among those that keep finger and token clear of the others. A planner tries the best of them in
-an engine of its own, and after the best of these others.
+A push is worth what it leaves: the pushes that each token then needs if it lies alone, and more
+where finger and token would meet others on their way. The table looks for the best push in thought;
+a planner tries the best of them in an engine of its own.
 
-Legend: N pushes of a shape, n of them, K tokens, V corners, C corners of a token.
+Legend: N pushes of a shape, n rows, K tokens, V corners, C corners of a token, m pushes.
 """
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
-from operator import itemgetter
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats, Ints, Singles
+from tangram_core.arrays import AnyArray, Bools, Complex, Floats, Ints, Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Generators, History
-from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import outlines_at, shared_area
-from tangram_sim.geometry.shapes import Shape
-from tangram_sim.world.pushing import PushTable, Unknowns
+from tangram_sim.world.pushing import Unknowns
+from tangram_tasks.push.alone import after, moved_by, tried_alone, way_left
 from tangram_tasks.push.order import come_next
-from tangram_tasks.push.places import apart, on_table, push_of
+from tangram_tasks.push.places import apart, on_table
 from tangram_tasks.push.trials import Trials, middle
 
 if TYPE_CHECKING:
     from tangram_tasks.push.env import PushEnv
     from tangram_tasks.push.task import Push
 
-PUSHES = 3000  # of each shape
-FIRST, SECOND = 120, 1000  # that are followed in thought, half the best, half any; and by these
-CLEAR = 0.02  # share of a token that may come to lie on another: it is pushed aside a little
-WAY_POINTS = 4  # of a token's way that are looked at
-BLOCKED = 1e3  # cost of a push that is not clear
-TRIED, KEPT, NEXT = 36, 8, 12  # pushes in an engine, the best of them, and after each of these
-LATER = 0.1  # of what is left now counts, beside what is left then: sooner is better
+TRIED = 24  # pushes in an engine
+LOOKED_AT, LENGTH = 48, 6  # pushes in thought, half the best, half any; and one after another
+PAIR = 2  # tokens of which each may come first
+SHARES = 1.0 / 3.0, 2.0 / 3.0, 1.0  # of a token's way that are looked at
+SLACK, SLOPE, HARDEST = 0.004, 40.0, 1.5  # depth that costs nothing, cost of more, and its most
+NEVER, MOST = 100.0, 3.0  # cost of what cannot be done; as much as one push in thought may cost
+AGAIN, REACH = 0.5, 0.1  # cost of what leads to what has been before, and how near that is
+STILL = 1e-4  # corners that are all nearer than this have not moved
 WRONG = 2.0  # by which a planner is wrong about friction
-
-
-@dataclass(frozen=True, eq=False)
-class Pushes:
-    """What random pushes do to a shape that lies alone.
-
-    Attributes:
-        actions: (N, 3) where, turn, far.
-        moved: (N, 3) x, y and turn of the token in its own frame.
-        begins, ends: (N, 2) of the finger, there.
-    """
-
-    actions: Floats
-    moved: Floats
-    begins: Floats
-    ends: Floats
-
-
-@lru_cache(maxsize=64)
-def tried_alone(
-    shape: Shape, finger: float, longest: float, friction: float, spread: float
-) -> Pushes:
-    """Random pushes of a shape; some seconds when they are asked for first."""
-    layout, rng = Layout([shape]), np.random.default_rng(0)
-    table, present = PushTable(layout, finger), np.ones(1, np.bool_)
-    unknowns = Unknowns(np.ones(1), np.full(1, spread), friction, np.zeros((1, 2)))
-    table.place(np.zeros((1, 3)), present, unknowns)
-    actions, moved = rng.uniform(-1.0, 1.0, (PUSHES, 3)), np.zeros((PUSHES, 3))
-    begins, ends = np.zeros((2, PUSHES, 2))
-    corners = layout.corners(np.zeros((1, 3)))
-    for i, action in enumerate(actions):
-        push = push_of(layout, corners, np.append(0.0, action), finger, longest)
-        table.lay(np.zeros((1, 3)))
-        table.push(push.begin, push.way)
-        moved[i], begins[i], ends[i] = table.poses()[0], push.begin, push.begin + push.way
-    table.close()
-    return Pushes(actions, moved, begins, ends)
-
-
-def _error(pose: Floats, desired: Floats) -> Floats:
-    """(3,) the way from a pose to another, in its own frame."""
-    way = (desired[:2] - pose[:2]) @ (1.0, 1j) * np.exp(-1j * pose[2])
-    return np.array([way.real, way.imag, desired[2] - pose[2]])
-
-
-def after(errors: Floats, moved: Floats) -> Floats:
-    """(..., 3) ways that are left, in the frames of tokens that moved by (..., 3) in theirs."""
-    left = (errors[..., :2] - moved[..., :2]) @ (1.0, 1j) * np.exp(-1j * moved[..., 2])
-    return np.stack([left.real, left.imag, errors[..., 2] - moved[..., 2]], axis=-1)
 
 
 class Planner:
@@ -98,27 +46,23 @@ class Planner:
         Args:
             task: what is played.
             env: where.
-            tried: pushes that are tried in an engine before one is played, and a few after them;
-                0: none.
+            tried: pushes that are tried in an engine before one is played; 0: none.
             knows: of friction and centres of mass: middle, of what they are drawn from; all; wrong,
                 the finger's friction and the lever of the table's twice the middle.
         """
-        self._middle, config = middle(task), task.config
+        self._middle, config, layout = middle(task), task.config, task.layout
         self._env, self._count, self._knows = env, tried, knows
-        self._trials = Trials(task)
-        self._task, self._layout = task, task.layout
-        spread, friction = float(self._middle.spread[0]), self._middle.finger
-        self._tried = [
-            tried_alone(one, config.finger, config.longest, friction, spread)
-            for one in task.layout.shapes
-        ]
-        self._periods = 2.0 * np.pi / task.layout.symmetries
+        self._trials, self._task, self._layout = Trials(task), task, layout
+        known = self._middle.finger, float(self._middle.spread[0])
+        ways = config.finger, config.longest, config.within, config.turned
+        found = [tried_alone(shape, known, *ways) for shape in layout.shapes]
+        self._tried, self._left = [one for one, _ in found], [one for _, one in found]
+        self._bodies = layout.body[layout.padded_corners] @ (1.0, 1j)
 
-    def __call__(self, seen: Arrays, past: History, generators: Generators) -> Singles:  # noqa: ARG002
+    def __call__(self, seen: Arrays, past: History, generators: Generators) -> Singles:
         """(B, 4) the push after which least is left to go."""
-        knows = map(self._known, range(len(generators)))
-        rows = zip(seen["corners"], seen["goals"], knows, generators, strict=True)
-        return np.stack([self._best(*row) for row in rows]).astype(np.float32)
+        tables = range(len(generators))
+        return np.stack([self._best(seen, past, table) for table in tables]).astype(np.float32)
 
     def _known(self, table: int) -> Unknowns:
         if self._knows == "all":
@@ -126,118 +70,148 @@ class Planner:
         own, times = self._middle, WRONG if self._knows == "wrong" else 1.0
         return replace(own, spread=own.spread * times, finger=own.finger * times)
 
-    def _best(
-        self, corners: Floats, goals: Floats, knows: Unknowns, rng: np.random.Generator
-    ) -> Floats:
-        scene = np.asarray(corners, np.float64), np.asarray(goals, np.float64)
-        found = self._proposed(*scene, max(1, self._count), rng)
-        tried = self._outcomes(*scene, knows, found)[:KEPT] if self._count else []
-        if not tried:
-            return min(found, key=itemgetter(0))[1] if found else np.zeros(4)
-        costs = list[float]()
-        for left, _, there in tried:
-            more = self._proposed(there, scene[1], NEXT, rng)
-            then = [one[0] for one in self._outcomes(there, scene[1], knows, more)]
-            costs.append(min([left, *then]) + LATER * left)
-        return tried[int(np.argmin(costs))][1]
+    def _best(self, seen: Arrays, past: History, table: int) -> Floats:
+        corners, goals, before = (
+            np.asarray(one[table], np.float64)
+            for one in (seen["corners"], seen["goals"], past.seen["corners"])
+        )
+        here = np.abs(before[:-1] - corners).max(axis=(1, 2)) < STILL
+        found, following = self._proposed(corners, goals, past.actions[table][here])
+        if not self._count or not len(found):
+            return np.asarray(found[0] if len(found) else np.zeros(4))
+        self._trials.begin(corners, goals, self._known(table))
+        ends = [(one, self._trials.after(one)) for one in found]
+        played = [(one, end) for one, end in ends if end is not None]
+        if not played:
+            return np.asarray(found[0])
+        laid = np.stack([end for _, end in played])
+        placed = self._task.placed(laid, np.broadcast_to(goals, laid.shape)).sum(axis=1)
+        home = placed > self._task.placed(corners[None], goals[None]).sum()
+        off = np.abs(laid[:, None] - before).max(axis=(2, 3))
+        again = AGAIN * (1.0 - off / REACH).clip(0.0).sum(axis=1)
+        left = self._worth(laid, goals, following) + np.where(home, 0.0, again)
+        return np.asarray(played[int(left.argmin())][0])
 
-    def _proposed(
-        self, corners: Floats, goals: Floats, count: int, rng: np.random.Generator
-    ) -> list[tuple[float, Floats]]:
-        """About so many pushes (4,), each after its cost: what is left if it is alone."""
-        task, present = self._task, on_table(goals, self._layout)
-        placed = task.placed(corners[None], goals[None])[0]
-        following, left = come_next(self._layout, corners, goals, placed), present & ~placed
-        found = self._of(following, corners, goals, count, rng)
-        if all(cost > BLOCKED / 2.0 for cost, _ in found) and (following != left).any():
-            return self._of(left, corners, goals, count, rng)
-        return found
+    def _proposed(self, corners: Floats, goals: Floats, made: AnyArray) -> tuple[Floats, Ints]:
+        """(m, 4) the best pushes first, but those that did nothing here, and of which tokens."""
+        placed = self._task.placed(corners[None], goals[None])[0]
+        left = on_table(goals, self._layout) & ~placed
+        following = come_next(self._layout, corners, goals, placed)
+        for tokens in (following, left):  # where none can be pushed that comes next, any
+            costs, pushes = self._ranked(tokens, corners, goals)
+            here = np.abs(pushes[:, None] - made).max(axis=2, initial=0.0) < STILL
+            possible = (costs < NEVER / 2.0) & ~here.any(axis=1)
+            if possible.any():
+                break
+        order = np.argsort(costs[possible])[: max(1, self._count)]
+        return pushes[possible][order], np.flatnonzero(tokens)
 
-    def _of(
-        self, those: Bools, corners: Floats, goals: Floats, count: int, rng: np.random.Generator
-    ) -> list[tuple[float, Floats]]:
-        """The same of some tokens (K,)."""
-        layout, tokens = self._layout, np.flatnonzero(those).tolist()
+    def _ranked(self, those: Bools, corners: Floats, goals: Floats) -> tuple[Floats, Floats]:
+        """What all pushes of some tokens (K,) cost more than the best of the same one, and them."""
+        layout, costs, pushes = self._layout, [np.zeros(0)], [np.zeros((0, 4))]
         poses, desired = layout.poses(corners), layout.poses(goals)
-        found: list[tuple[float, Floats]] = []
-        for token in tokens:
-            error = _error(poses[token], desired[token])
-            chosen, costs = self._ranked(token, error, rng)
-            clear = self._clear(token, chosen, poses, on_table(goals, layout))
-            costs = np.where(clear, costs, costs + BLOCKED) - self._cost(token, error[None])[0]
-            named = (token + 0.5) / layout.tokens * 2.0 - 1.0
-            for i in np.argsort(costs)[: max(1, count // len(tokens))].tolist():
-                action = np.append(named, self._tried[token].actions[chosen[i]])
-                found.append((float(costs[i]), action))
-        return found
+        for token in np.flatnonzero(those).tolist():
+            own, every = self._tried[token], np.arange(len(self._tried[token].moved))
+            left = after(way_left(poses[token], desired[token])[None], own.moved)
+            at = np.broadcast_to(poses[token], left.shape)
+            cost = self._left[token](left) + self._met(
+                token, at, every, self._others(token, poses[None], goals)
+            )
+            named = np.full((len(every), 1), (token + 0.5) / layout.tokens * 2.0 - 1.0)
+            costs.append(cost - min(cost.min(), NEVER / 2.0))
+            pushes.append(np.concatenate([named, own.actions], axis=1))
+        return np.concatenate(costs), np.concatenate(pushes)
 
-    def _outcomes(
-        self, corners: Floats, goals: Floats, knows: Unknowns, pushes: list[tuple[float, Floats]]
-    ) -> list[tuple[float, Floats, Floats]]:
-        """What is left after those that the engine allows, the least first, pushes and corners."""
-        self._trials.begin(corners, goals, knows)
-        found = [(one, self._trials.after(one)) for _, one in pushes]
-        left = [(self._left(at, goals), one, at) for one, at in found if at is not None]
-        return sorted(left, key=itemgetter(0))
+    def _worth(self, corners: Floats, goals: Floats, following: Ints) -> Floats:
+        """(n,) pushes that are left where tokens have corners (n, V, 2), in the better order.
 
-    def _left(self, corners: Floats, goals: Floats) -> float:
-        """What is left of all tokens: the least pushes first."""
-        now, desired, whole = self._layout.poses(corners), self._layout.poses(goals), 0.0
-        for token in np.flatnonzero(on_table(goals, self._layout)).tolist():
-            error = _error(now[token], desired[token])
-            cost = float(self._cost(token, error[None])[0])
-            if cost > 1.0:
-                after_one = self._cost(token, after(error, self._tried[token].moved)).min()
-                whole += 2.0 + float(after_one)
-            else:
-                whole += 0.2 * cost
-        return whole
+        One of those that come next goes first, beside the others; with two the other goes then,
+        beside the first in its place; more are taken to lie alone.
+        """
+        poses, desired = self._layout.poses(corners), self._layout.poses(goals)
+        there = np.flatnonzero(on_table(goals, self._layout)).tolist()
+        needs = {k: self._left[k](way_left(poses[:, k], desired[k])) for k in there}
+        best = np.full(len(corners), np.inf)
+        for first in there if len(there) <= PAIR else following.tolist():
+            rest = [token for token in there if token != first]
+            now = [self._laid(token, poses[:, token]) for token in rest]
+            whole = self._followed(first, poses[:, first], desired[first], now)
+            for token in rest:
+                if len(there) == PAIR:
+                    then = [self._laid(first, np.tile(desired[first], (len(poses), 1)))]
+                    whole += self._followed(token, poses[:, token], desired[token], then)
+                else:
+                    whole += needs[token]
+            best = np.minimum(best, whole)
+        return best
 
-    def _ranked(self, token: int, error: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
-        """Pushes (n,), and what is left after them and the best that may follow."""
-        moved = self._tried[token].moved
-        first = after(error, moved)
-        costs = self._cost(token, first)
-        order = np.argsort(costs)
-        any_of = rng.integers(PUSHES, size=FIRST // 2)
-        chosen = np.concatenate([order[: FIRST // 2], any_of])
-        second = self._cost(token, after(first[chosen][:, None], moved[None, :SECOND])).min(axis=1)
-        one = costs[chosen]
-        return chosen, np.where(one <= 1.0, one, 1.0 + second)
+    def _followed(
+        self, token: int, poses: Floats, desired: Floats, others: Sequence[Complex]
+    ) -> Floats:
+        """(n,) pushes that bring a token from poses (n, 3) home in thought, beside outlines (n, C).
 
-    def _cost(self, token: int, errors: Floats) -> Floats:
-        """(...) of ways that are left (..., 3), in tolerances."""
-        period, config = self._periods[token], self._task.config
-        turn = errors[..., 2] - period * np.round(errors[..., 2] / period)
-        far = np.hypot(errors[..., 0], errors[..., 1]) / config.within
-        cost: Floats = np.hypot(far, turn / config.turned)
-        return cost
+        The best each time; after LENGTH of them as many as it needs alone.
+        """
+        left, own, poses = self._left[token], self._tried[token].moved, poses.copy()
+        alone, whole, half = left(way_left(poses, desired)), np.zeros(len(poses)), LOOKED_AT // 2
+        for _ in range(LENGTH):
+            ways = way_left(poses, desired)
+            going = np.flatnonzero(~left.near(ways))
+            if not len(going):
+                break
+            counts = left(after(ways[going, None], own[None]))
+            best = np.argpartition(counts, half, axis=1)[:, :half]
+            some = np.concatenate([best, np.tile(np.arange(half), (len(going), 1))], axis=1)
+            each = np.repeat(going, 2 * half)
+            met = self._met(token, poses[each], some.ravel(), [one[each] for one in others])
+            met = np.minimum(met, MOST).reshape(some.shape)
+            rows = np.arange(len(going))
+            at = (np.take_along_axis(counts, some, axis=1) + met).argmin(axis=1)
+            whole[going] += 1.0 + met[rows, at]
+            poses[going] = moved_by(poses[going], own[some[rows, at]])
+        return np.maximum(alone, whole + left(way_left(poses, desired)))
 
-    def _clear(self, token: int, chosen: Ints, poses: Floats, present: Bools) -> Bools:
-        """(n,) whether finger and token keep clear of the other tokens, and of the table's edge."""
-        own, layout = self._tried[token], self._layout
-        turn, place = np.exp(1j * poses[token, 2]), poses[token, :2] @ (1.0, 1j)
-        begin, end = (place + turn * (at[chosen] @ (1.0, 1j)) for at in (own.begins, own.ends))
-        edge = 1.0 - self._task.config.finger
-        clear = np.ones(len(chosen), np.bool_)
-        for at in (begin, end):
-            clear &= np.maximum(np.abs(at.real), np.abs(at.imag)) <= edge
-        others = [k for k in np.flatnonzero(present).tolist() if k != token]
-        if not others:
-            return clear
-        bodies = layout.body[layout.padded_corners]
-        sides = np.zeros(len(others), np.bool_)
-        outlines = outlines_at(bodies[others], poses[others], sides)
-        for share in np.arange(1, WAY_POINTS + 1) / WAY_POINTS:
-            moved = own.moved[chosen] * share
-            at = place + turn * (moved[:, :2] @ (1.0, 1j))
-            whole = np.stack([at.real, at.imag, poses[token, 2] + moved[:, 2]], axis=1)
-            laid = outlines_at(bodies[token], whole, np.zeros(len(whole), np.bool_))
-            finger = begin + share * (end - begin)
-            for outline in outlines:
-                pairs = np.broadcast_to(outline, laid.shape)
-                clear &= shared_area(laid, pairs) <= CLEAR * layout.areas[token]
-                clear &= apart(outline @ (1.0, 1j), finger) >= self._task.config.finger
-        for outline in outlines:
-            clear &= apart(outline @ (1.0, 1j), begin) >= self._task.config.finger
-        return clear
+    def _others(self, token: int, poses: Floats, goals: Floats) -> list[Complex]:
+        """(n, C) outlines of each other token on the table at poses (n, K, 3)."""
+        there = np.flatnonzero(on_table(goals, self._layout)).tolist()
+        return [self._laid(one, poses[:, one]) for one in there if one != token]
+
+    def _laid(self, token: int, poses: Floats) -> Complex:
+        """(n, C) the outline of a token at poses (n, 3)."""
+        turned: Complex = np.exp(1j * poses[:, 2:]) * self._bodies[token]
+        return _places(poses)[:, None] + turned
+
+    def _met(self, token: int, poses: Floats, pushes: Ints, others: Sequence[Complex]) -> Floats:
+        """(n,) cost of what finger and token meet by pushes (n,) of a token at poses (n, 3)."""
+        own, radius = self._tried[token], self._task.config.finger
+        turn, place, moved = np.exp(1j * poses[:, 2]), _places(poses), own.moved[pushes]
+        begin, end = (place + turn * _places(at[pushes]) for at in (own.begins, own.ends))
+        reach = np.maximum(np.abs([begin.real, end.real]), np.abs([begin.imag, end.imag])).max(0)
+        cost = np.where(reach > 1.0 - radius, NEVER, 0.0)
+        gaps = np.ones(len(pushes))
+        for outline in others:
+            cost[apart(outline, begin) < radius] = NEVER
+            for share in SHARES:
+                laid = self._laid(token, moved_by(poses, moved * share))
+                np.minimum(gaps, _gaps(laid, outline), out=gaps)
+                finger = begin + share * (end - begin)
+                np.minimum(gaps, apart(outline, finger) - radius, out=gaps)
+        return cost + np.clip(SLOPE * (-gaps - SLACK), 0.0, HARDEST)
+
+
+def _places(poses: Floats) -> Complex:
+    """(n,) x and y as complex numbers."""
+    places: Complex = poses[..., :2] @ np.array([1.0, 1j])
+    return places
+
+
+def _gaps(some: Complex, others: Complex) -> Floats:
+    """(n,) between convex polygons (n, C), by the separating axis theorem; minus the depth."""
+    found = list[Floats]()
+    for one, other in ((some, others), (others, some)):
+        edges = np.roll(one, -1, axis=1) - one
+        lengths = np.abs(edges)
+        normals = edges.conj() / np.maximum(lengths, 1e-9)
+        nearest = -(normals[:, :, None] * (other[:, None] - one[:, :, None])).imag.max(axis=2)
+        found.append(np.where(lengths < 1e-9, -np.inf, nearest).max(axis=1))
+    return np.maximum(*found)

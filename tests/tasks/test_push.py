@@ -12,6 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import tangram_sim.world.pushing as table_module
+import tangram_tasks.push.alone as alone_module
 import tangram_tasks.push.rivals as rival_module
 from tangram_core.conformance import check_task, play
 from tangram_core.errors import ConfigError, SamplingError
@@ -39,18 +40,18 @@ def generators(count: int) -> list[np.random.Generator]:
 
 @pytest.fixture
 def few_tried(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(rival_module, "PUSHES", 300)
-    rival_module.tried_alone.cache_clear()
+    for name, less in (("PUSHES", 300), ("GRID", (13, 13, 9)), ("SWEEPS", 6)):
+        monkeypatch.setattr(alone_module, name, less)
+    alone_module.tried_alone.cache_clear()
     yield
-    rival_module.tried_alone.cache_clear()
+    alone_module.tried_alone.cache_clear()
 
 
 @pytest.mark.parametrize("task", [SQUARE, SOME], ids=["square", "two of three"])
 def test_it_keeps_the_promises_of_a_task(
     task: Push, few_tried: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("TRIED", "KEPT", "NEXT"):
-        monkeypatch.setattr(rival_module, name, 2)
+    monkeypatch.setattr(rival_module, "TRIED", 2)
     check_task(task)
 
 
@@ -345,6 +346,20 @@ def test_the_middle_of_a_row_comes_before_its_second_end() -> None:
     assert found.tolist() == [False, True, True]  # the last lies in the middle
 
 
+def test_no_push_is_left_in_place_and_more_are_further_away(few_tried: None) -> None:
+    ways = SQUARE.layout.shapes[0], (0.35, 1.45), FINGER, LONGEST, 0.03, 0.1
+    _, left = alone_module.tried_alone(*ways)
+    found = left(np.array([[0.02, 0, 0.05], [0.0, 0.02, np.pi / 2], [0.2, 0, 0], [1.5, 1.5, 0.7]]))
+    assert found[:2].tolist() == [0.0, 0.0]
+    assert 1.0 <= found[2] < found[3]
+
+
+def test_gaps_of_convex_polygons_are_negative_where_they_overlap() -> None:
+    square = np.array([[0, 1, 1 + 1j, 1j]])
+    others = np.stack([square[0] + 1.5, square[0] + 0.9j, square[0] + 0.2 + 0.4j])
+    np.testing.assert_allclose(rival_module._gaps(square, others), [0.5, -0.1, -0.6])
+
+
 def test_rivals_push_what_comes_next_and_others_where_that_cannot_be(
     few_tried: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -354,9 +369,11 @@ def test_rivals_push_what_comes_next_and_others_where_that_cannot_be(
     corners = corners_of(layout, poses, present)
     goals = corners_of(layout, poses + [0.0, 0.4, 0.0], present)
     with closing(SOME.make(1)) as env:
-        planner = rival_module.Planner(SOME, env)  # type: ignore[arg-type]
+        planner = rival_module.Planner(SOME, env, 600)  # type: ignore[arg-type]
     for following, pushed in (([0, 1, 0], {1}), ([1, 0, 0], {0}), ([0, 0, 0], {0, 1})):
         next_ones = np.array(following, np.bool_)
         monkeypatch.setattr(rival_module, "come_next", lambda *_, found=next_ones: found)
-        found = planner._proposed(corners, goals, 10, np.random.default_rng(0))
-        assert {int((push[0] + 1.0) / 2.0 * 3) for _, push in found} == pushed
+        found, tokens = planner._proposed(corners, goals, np.zeros((0, 4)))
+        assert (
+            {*((found[:, 0] + 1.0) / 2.0 * 3).astype(int).tolist()} == pushed == {*tokens.tolist()}
+        )

@@ -201,7 +201,7 @@ def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
     status, _, err = here("tangram-play", *told[:1], "puzzle=dodo", cwd=tmp_path)
     assert status == 2
     assert "no puzzle 'dodo': choose from" in err
-    for wrong, reason in (("turns=2", "leave turns"), ("task.count=2", "needs all seven")):
+    for wrong, reason in (("turns=2", "without turns"), ("task.count=2", "needs all seven")):
         status, _, err = here("tangram-play", *told, wrong, cwd=tmp_path)
         assert (status, reason in err) == (2, True), err
 
@@ -210,7 +210,7 @@ def test_a_task_without_a_plan_writes_none(tmp_path: Path) -> None:
     told = ("run_dir=pretrained/square", f"out={tmp_path / 'x.json'}")
     status, _, err = here("tangram-play", *told, cwd=tmp_path)
     assert (status, list(tmp_path.iterdir())) == (2, [])
-    assert "task=place makes no plan, set out=play.gif" in err
+    assert "task=place makes no plan: set out=play.gif" in err
 
 
 def test_an_arm_that_never_pushed_is_filmed_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
