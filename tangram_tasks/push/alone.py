@@ -59,34 +59,43 @@ def moved_by(poses: Floats, moved: Floats) -> Floats:
 class Left:
     """How many pushes a token that lies alone needs."""
 
-    def __init__(self, pushes: Pushes, period: float, within: float, turned: float) -> None:
+    def __init__(
+        self, pushes: Pushes, period: float, within: float, turned: float, margin: float
+    ) -> None:
         """Iterate; some seconds.
 
         Args:
             pushes: to choose from.
             period: turn that comes to the same.
             within, turned: tolerances of a token that is in place.
+            margin: cost of one that is as far away as it may be: friction may add to it.
         """
-        self._period, self._scale = period, np.array([within, within, turned])
+        self._period, self._margin, self._scale = period, margin, np.array([within, within, turned])
         self._most = np.arcsinh([FAR, FAR, period / 2.0] / self._scale)
         axes = [np.linspace(-1.0, 1.0, size) for size in GRID]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * self._most
         ways = self._scale * np.sinh(points)
         then = after(ways[:, None], pushes.moved[None, :FEW])
-        at, near = self._at(then), self.near(then)
+        at, near, off = self._at(then), self.near(then), self._off(then)
         self._counts = 1.0 + np.linalg.norm(points, axis=1).reshape(GRID)
         for _ in range(SWEEPS):
-            found = np.where(near, 0.0, self._looked_up(at))
+            found = np.where(near, off, self._looked_up(at))
             self._counts = 1.0 + found.min(axis=1).reshape(GRID)
 
     def __call__(self, ways: Floats) -> Floats:
-        """(...) of ways that are left (..., 3)."""
-        return np.where(self.near(ways), 0.0, self._looked_up(self._at(ways)))
+        """(...) of ways that are left (..., 3); in place below 1, the less the nearer."""
+        return np.where(self.near(ways), self._off(ways), self._looked_up(self._at(ways)))
 
     def near(self, ways: Floats) -> Bools:
         """(...) whether nothing is left."""
         far, turn = np.hypot(ways[..., 0], ways[..., 1]), np.abs(self._wrapped(ways[..., 2]))
         return np.asarray((far <= self._scale[0]) & (turn <= self._scale[2]))
+
+    def _off(self, ways: Floats) -> Floats:
+        """(...) cost of tokens in place that are not quite where they should be."""
+        parts = ways[..., 0], ways[..., 1], self._wrapped(ways[..., 2])
+        found: Floats = np.linalg.norm(np.stack(parts, axis=-1) / self._scale, axis=-1)
+        return self._margin * found
 
     def _wrapped(self, turns: Floats) -> Floats:
         least: Floats = turns - self._period * np.round(turns / self._period)
@@ -118,7 +127,7 @@ def tried_alone(
         known: the finger's friction, and the squared lever of the table's.
         finger: its radius.
         longest: way of the longest push.
-        *within: tolerances of a token that is in place, of distance and turn.
+        *within: tolerances of a token that is in place, of distance and turn, and the margin.
     """
     layout, rng = Layout([shape]), np.random.default_rng(0)
     table, present = PushTable(layout, finger), np.ones(1, np.bool_)

@@ -32,6 +32,7 @@ PAIR = 2  # tokens of which each may come first
 SHARES = 1.0 / 3.0, 2.0 / 3.0, 1.0  # of a token's way that are looked at
 SLACK, SLOPE, HARDEST = 0.004, 40.0, 1.5  # depth that costs nothing, cost of more, and its most
 NEVER, MOST = 100.0, 3.0  # cost of what cannot be done; as much as one push in thought may cost
+MARGIN = 0.5  # cost to the table of a token that is as far away as it may be in place
 AGAIN, REACH = 0.5, 0.1  # cost of what leads to what has been before, and how near that is
 STILL = 1e-4  # corners that are all nearer than this have not moved
 WRONG = 2.0  # by which a planner is wrong about friction
@@ -54,7 +55,8 @@ class Planner:
         self._env, self._count, self._knows = env, tried, knows
         self._trials, self._task, self._layout = Trials(task), task, layout
         known = self._middle.finger, float(self._middle.spread[0])
-        ways = config.finger, config.longest, config.within, config.turned
+        margin = 0.0 if tried else MARGIN
+        ways = config.finger, config.longest, config.within, config.turned, margin
         found = [tried_alone(shape, known, *ways) for shape in layout.shapes]
         self._tried, self._left = [one for one, _ in found], [one for _, one in found]
         self._bodies = layout.body[layout.padded_corners] @ (1.0, 1j)

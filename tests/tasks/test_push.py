@@ -347,10 +347,10 @@ def test_the_middle_of_a_row_comes_before_its_second_end() -> None:
 
 
 def test_no_push_is_left_in_place_and_more_are_further_away(few_tried: None) -> None:
-    ways = SQUARE.layout.shapes[0], (0.35, 1.45), FINGER, LONGEST, 0.03, 0.1
+    ways = SQUARE.layout.shapes[0], (0.35, 1.45), FINGER, LONGEST, 0.03, 0.1, 0.5
     _, left = alone_module.tried_alone(*ways)
     found = left(np.array([[0.02, 0, 0.05], [0.0, 0.02, np.pi / 2], [0.2, 0, 0], [1.5, 1.5, 0.7]]))
-    assert found[:2].tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(found[:2], [0.5 * np.hypot(2 / 3, 1 / 2), 1 / 3])
     assert 1.0 <= found[2] < found[3]
 
 
