@@ -367,6 +367,13 @@ def test_help_names_presets_of_ones_own(
     assert "medium_triangle, mine, pair" in capsys.readouterr().out.replace("\n           ", " ")
 
 
+def test_help_of_a_task_is_that_of_its_agent(
+    entered: Entered, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert entered("train task=push --help agent") == (0, [])
+    assert "agent.looked_at: 96" in capsys.readouterr().out
+
+
 # The entry of every command
 
 
@@ -438,6 +445,7 @@ def test_entry_does_not_hide_a_fault_of_ours(entered: Entered) -> None:
         ("train tokens=3", "a config group takes the name of a preset, and no number"),
         (f"train seed={'[' * 3000}{']' * 3000}", "nested too deeply: write fewer brackets"),
         ("eval run_dir=x sim=kinematic", "sim=kinematic chooses a preset, and a trained run has"),
+        ("eval run_dir=x tokens=square", "unknown setting 'tokens' (a trained run keeps its own)"),
         ("train seed=\x1b[1m", "cannot read 'seed=\\x1b[1m': write name=value"),
         ("train sim=[physics,kinematic]", "sim takes one preset, got [physics,kinematic]"),
         ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),

@@ -135,10 +135,9 @@ class Planner:
         needs = {k: self._left[k](way_left(poses[:, k], desired[k])) for k in there}
         best = np.full(len(corners), np.inf)
         for first in there if len(there) <= PAIR else following.tolist():
-            rest = [token for token in there if token != first]
-            now = [self._laid(token, poses[:, token]) for token in rest]
+            now = self._others(first, poses, goals)
             whole = self._followed(first, poses[:, first], desired[first], now)
-            for token in rest:
+            for token in [one for one in there if one != first]:
                 if len(there) == PAIR:
                     then = [self._laid(first, np.tile(desired[first], (len(poses), 1)))]
                     whole += self._followed(token, poses[:, token], desired[token], then)

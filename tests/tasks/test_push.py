@@ -346,6 +346,11 @@ def test_the_middle_of_a_row_comes_before_its_second_end() -> None:
     assert found.tolist() == [False, True, True]  # the last lies in the middle
 
 
+def test_layouts_that_find_room_now_and_then_are_refused() -> None:
+    with pytest.raises(SamplingError, match="no room for square, square, square, square on a"):
+        Push(TokensConfig(("square",) * 4, 1.7)).check(plays=False)
+
+
 def test_no_push_is_left_in_place_and_more_are_further_away(few_tried: None) -> None:
     ways = SQUARE.layout.shapes[0], (0.35, 1.45), FINGER, LONGEST, 0.03, 0.1, 0.5
     _, left = alone_module.tried_alone(*ways)
@@ -377,3 +382,5 @@ def test_rivals_push_what_comes_next_and_others_where_that_cannot_be(
         assert (
             {*((found[:, 0] + 1.0) / 2.0 * 3).astype(int).tolist()} == pushed == {*tokens.tolist()}
         )
+        others, _ = planner._proposed(corners, goals, found[:2])  # made here already
+        np.testing.assert_array_equal(others, found[2:])
