@@ -5,6 +5,7 @@ docs/gymnasium.md has whole examples; `Run.act` gives them for corners, see docs
 `load_run("pretrained/square")` gives one of the agents that come with the package.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -108,7 +109,7 @@ class Run:
         """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
 
         Args:
-            observation: of `TangramEnv`, or of several: each entry with B rows then.
+            observation: of a `TaskEnv`, or of several: each entry with B rows then.
 
         Returns:
             (A,) in [-1, 1], which `step` takes; (B, A) for B rows.
@@ -116,29 +117,26 @@ class Run:
         Raises:
             ConfigError: an observation of another form, or of another set of tokens.
         """
-        shown, layout = self._checked(observation), self.task.layout
-        corners, goals = (
-            shown[name].reshape(-1, layout.corner_count, 2)
-            for name in ("achieved_goal", "desired_goal")
-        )
-        flags = shown["observation"][..., -layout.tokens :].reshape(-1, layout.tokens)
-        actions = self.act({"corners": corners, "placed": flags > 0.5, "goals": goals})
+        spec, shown = self.setup.spec, self._checked(observation)
+        desired = spec.field(spec.desired)
+        seen: dict[str, Any] = {desired.name: shown["desired_goal"].reshape(-1, *desired.shape)}
+        fields = [one for one in spec.fields if one is not desired]
+        parts = np.cumsum([math.prod(one.shape) for one in fields])[:-1]
+        for one, part in zip(fields, np.split(shown["observation"], parts, axis=-1), strict=True):
+            values = part.reshape(-1, *one.shape)
+            seen[one.name] = values if one.dtype == "f4" else values > 0.5
+        actions = self.act(seen)
         single: Singles = actions if shown["observation"].ndim > 1 else actions[0]
         return single
 
     def _checked(self, observation: object) -> dict[str, Floats]:
         """The entries as arrays, all for as many rows."""
-        if self.task.outlines:
-            raise ConfigError(
-                f"{self.folder} fills outlines, which no observation has: call act with "
-                "goals that tangram_sim.geometry.rings.as_rows makes"
-            )
-        layout = self.task.layout
-        corners = 2 * layout.corner_count
+        spec = self.setup.spec
+        size = {one.name: math.prod(one.shape) for one in spec.fields}
         wanted = {
-            "observation": corners + layout.tokens,
-            "achieved_goal": corners,
-            "desired_goal": corners,
+            "observation": sum(size.values()) - size[spec.desired],
+            "achieved_goal": size[spec.achieved],
+            "desired_goal": size[spec.desired],
         }
         if not isinstance(observation, Mapping) or wanted.keys() - observation.keys():
             given = f"a {type(observation).__name__}"
@@ -153,12 +151,12 @@ class Run:
         except (TypeError, ValueError) as error:
             raise ConfigError(f"an observation's entries must be numbers: {error}") from None
         rows = shown["observation"].shape[:-1][:1]
-        for name, size in wanted.items():
-            if shown[name].shape != (*rows, size) or 0 in rows:
+        for name, count in wanted.items():
+            if shown[name].shape != (*rows, count) or 0 in rows:
                 raise ConfigError(
                     f"observation['{name}'] has shape {shown[name].shape}, and {self.folder} wants "
-                    f"{(*(max(1, row) for row in rows), size)}: make the environment with this "
-                    "agent's tokens"
+                    f"{(*(max(1, row) for row in rows), count)}: give what tangram_tasks.goal_env."
+                    "TaskEnv(run.setup.task) shows"
                 )
             if not (np.abs(shown[name]) <= MAX_COORDINATE).all():
                 raise ConfigError(

@@ -102,6 +102,14 @@ class Env(ABC):
         """What scores are made of and no agent sees, (B, ...) each, now; the same names always."""
         return {}
 
+    def told(self) -> Json:
+        """What gymnasium's `info` has of the last step of the first environment."""
+        return {name: rows[0] for name, rows in self.facts().items()}
+
+    def picture(self, size: int) -> Pixels | None:  # noqa: ARG002
+        """The first environment as it is now, (size, size, 3); None: there is none."""
+        return None
+
     def close(self) -> None:  # noqa: B027
         """Let go of what it holds; calling it twice does no harm."""
 

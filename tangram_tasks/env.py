@@ -9,8 +9,9 @@ import numpy as np
 
 from tangram_core.arrays import Bools, Pixels, Singles
 from tangram_core.spec import Array, Arrays
-from tangram_core.task import Env, Generators, Purpose, Step
+from tangram_core.task import Env, Generators, Json, Purpose, Step
 from tangram_sim.batch import BatchedEnv, StepResult
+from tangram_sim.config import MAX_OVERLAP
 from tangram_sim.sight.perception import Eye, Look
 from tangram_sim.targets.targets import Sides
 from tangram_sim.world.world import no_opencv
@@ -84,6 +85,35 @@ class PlaceEnv(Env):
         if world.sight is not None:
             facts["pictures"] = world.pictures
         return facts
+
+    def told(self) -> Json:
+        """The overlap, whether that solves it, Eq. 14 of pictures, and why nothing moved."""
+        from tangram_tasks.metrics import SOLVED  # noqa: PLC0415  # scipy, which no worker needs
+
+        world, result = self.world, self._result
+        if result is None:
+            return {}
+        share, token = float(result.overlap[0]), int(result.tokens[0])
+        info: Json = {"overlap": share, "is_success": share >= SOLVED}
+        if result.camera_rewards is not None:
+            info["reward_camera"] = float(result.camera_rewards[0])
+        if result.refused[0]:
+            count = world.sim.actions_per_token
+            info["refused"] = f"token {token} is placed already: it had its {count} actions"
+        if result.blocked[0]:
+            info["refused"] = (
+                f"token {token} would lie on others by {result.covered[0]:.3%} of its area, "
+                f"at most {MAX_OVERLAP:.3%} allowed: set it down where there is room"
+            )
+        return info
+
+    def picture(self, size: int) -> Pixels:
+        """Tokens and target of the first world, the last mover marked."""
+        from tangram_sim.drawing.scenes import draw_scene  # noqa: PLC0415
+
+        world, moved = self.world, None if self._result is None else int(self._result.tokens[0])
+        scene = (world.corners[0], world.goals[0], size, moved)
+        return np.asarray(draw_scene(world.layout, world.sim.arena, *scene), np.uint8)
 
     def close(self) -> None:
         """Close all worlds."""

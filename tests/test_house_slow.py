@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 def test_master_and_registration_never_load_the_engine() -> None:
     loaded = run_python(
-        "import gymnasium, master.cli, master.launch, master.run, tangram_sim.register, sys\n"
+        "import gymnasium, master.cli, master.launch, master.run, sys, tangram_tasks.register\n"
         "assert 'Tangram-v0' in gymnasium.registry\n"
         "print([name for name in sys.modules if name.startswith(('pybullet', 'cv2'))])"
     )
@@ -266,8 +266,8 @@ def test_the_site_is_whole_and_asks_no_other_host(tmp_path: Path) -> None:
     for page in [name.parent if name.name == "README" else name for name in shown]:
         assert (tmp_path / page / "index.html").is_file()
     assert (
-        'id="tangram_sim.env.TangramEnv.step"'
-        in (tmp_path / "api" / "tangram_sim.env" / "index.html").read_text()
+        'id="tangram_tasks.goal_env.TaskEnv.step"'
+        in (tmp_path / "api" / "tangram_tasks.goal_env" / "index.html").read_text()
     )
     loads = r"<(?:script|img|source)[^>]* src=.?(?:https?:)?//|<link[^>]* href=.?(?:https?:)?//"
     loading = [p for p in tmp_path.rglob("*.*") if p.suffix in (".html", ".css")]

@@ -14,8 +14,8 @@ from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Arrays, Episodes
 from tangram_core.task import Generators, History
 from tangram_sim.geometry.layout import TokensConfig
-from tangram_sim.puzzles.assembly import COUNTS
 from tangram_tasks.place import Place
+from tangram_tasks.register import SEVEN
 from worker.play.rollout import Rollout
 
 
@@ -38,9 +38,6 @@ def goal_config(setup: Setup) -> GoalConfig:
 def place(setup: Setup) -> Place:
     """The task of such a setup."""
     return cast("Place", setup.task)
-
-
-SEVEN = tuple(name for name, count in COUNTS.items() for _ in range(count))
 
 
 def several(count: int) -> Setup:

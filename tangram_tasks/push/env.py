@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats, Singles
+from tangram_core.arrays import Bools, Floats, Pixels, Singles
 from tangram_core.spec import Arrays
-from tangram_core.task import Env, Generators, Step
+from tangram_core.task import Env, Generators, Json, Step
 from tangram_sim.world.arm import METRES, Panda
 from tangram_sim.world.pushing import PushTable, Unknowns
-from tangram_tasks.push.places import AWAY, begin, corners_of, push_of
+from tangram_tasks.push.places import ARENA, AWAY, begin, corners_of, push_of
 from tangram_tasks.push.trials import middle
 
 if TYPE_CHECKING:
@@ -113,6 +113,17 @@ class PushEnv(Env):
             "goals": self.goals.copy(),
             "refused": np.array([bool(why) for why in self.refused]),
         }
+
+    def told(self) -> Json:
+        """Why the last push moved nothing, where it did not."""
+        return {"refused": self.refused[0]} if self.refused[0] else {}
+
+    def picture(self, size: int) -> Pixels:
+        """The first table from above."""
+        from tangram_sim.drawing.scenes import draw_scene  # noqa: PLC0415
+
+        scene = (self.corners[0], self.goals[0], size, None)
+        return np.asarray(draw_scene(self._task.layout, ARENA, *scene), np.uint8)
 
     def close(self) -> None:
         """End the engine's clients."""

@@ -17,8 +17,8 @@ from tangram_core.errors import ConfigError, RunError, WireError
 from tangram_core.setup import Setup
 from tangram_core.wire.messages import decode_weights
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.env import TangramEnv
 from tangram_sim.motion.actions import chosen_tokens, flips, full_scale, velocities
+from tangram_tasks.goal_env import place
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
 from tests.agent.builders import (
     PAIR,
@@ -277,13 +277,16 @@ SHOWN = {"observation": 53, "achieved_goal": 46, "desired_goal": 46}
 def test_predict_takes_what_the_environments_show() -> None:
     made = seven({}, PERCEPTRON)
     run, world = run_of(made), {"backend": "kinematic", **SEVEN}
-    one, several = TangramEnv(**world), SyncVectorEnv([lambda: TangramEnv(**world)] * 3)
+    one, several = place(**world), SyncVectorEnv([lambda: place(**world)] * 3)
     observation, _ = one.reset(seed=1)
     observations, _ = several.reset(seed=0)
     for _ in range(3):  # with tokens that are placed, too
-        batch = one.batch
         actions = run.predict(observations)
-        shown = {"corners": batch.seen, "placed": batch.placed, "goals": batch.seen_goals}
+        shown = {
+            "corners": observation["achieved_goal"].reshape(1, -1, 2),
+            "placed": observation["observation"][None, -7:] > 0.5,
+            "goals": observation["desired_goal"].reshape(1, -1, 2),
+        }
         np.testing.assert_allclose(run.act(shown)[0], actions[1], atol=1e-5)
         alone = run.predict(observation)
         np.testing.assert_allclose(alone, actions[1], atol=1e-5)
@@ -298,12 +301,12 @@ def test_predict_takes_what_the_environments_show() -> None:
     [
         (
             {name: np.zeros(size - 2) for name, size in SHOWN.items()},
-            "observation.'observation'. has shape .51,., and run wants .53,.: make the environment",
+            "observation.'observation'. has shape .51,., and run wants .53,.: give what tangram_t",
         ),
         (
             {name: np.zeros((2, size)) for name, size in SHOWN.items()}
             | {"desired_goal": np.zeros(46)},
-            "observation.'desired_goal'. has shape .46,., and run wants .2, 46.: make",
+            "observation.'desired_goal'. has shape .46,., and run wants .2, 46.: give what",
         ),
         (
             {name: np.zeros((2, 2, size)) for name, size in SHOWN.items()},

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ import yaml
 from tangram_agent import pretrained
 from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS, agent_names, is_name
 from tangram_agent.runs import load_run
-from tangram_core.errors import ConfigError, RunError, TangramError
-from tangram_sim.env import TangramEnv
-from tangram_sim.register import KWARGS
+from tangram_core.errors import RunError, TangramError
+from tangram_tasks import goal_env
+from tangram_tasks.register import IDS
 from tests.agent.builders import (
     BFLOAT,
     NAN,
@@ -126,17 +127,25 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "agent"), [("Tangram-v0", "pretrained/square"), ("Tangram7-v0", "pretrained/tangram7")]
+    ("name", "agent"),
+    [
+        ("Tangram-v0", "pretrained/square"),
+        ("Tangram7-v0", "pretrained/tangram7"),
+    ],
 )
 def test_an_id_is_what_its_agent_was_trained_on(name: str, agent: str) -> None:
-    task = load_run(agent).task
-    env = TangramEnv(**KWARGS[name])
-    assert env.layout.fingerprint() == task.layout.fingerprint()
-    assert env.sim == task.sim
-    assert task.reward.name == "overlap"
-    env.close()
+    task, (kind, settings) = load_run(agent).setup.task, IDS[name]
+    with closing(getattr(goal_env, kind)(**settings)) as env:
+        assert env.task.identity() == task.identity()
 
 
-def test_an_agent_of_outlines_says_that_no_observation_has_them() -> None:
-    with pytest.raises(ConfigError, match=r"silhouette fills outlines, .* call act"):
-        load_run("pretrained/tangram7_silhouette").predict({})
+@pytest.mark.parametrize("name", agent_names())
+def test_an_agent_plays_the_environment_of_its_task(name: str) -> None:
+    run = load_run(f"pretrained/{name}")
+    with closing(goal_env.TaskEnv(run.setup.task)) as env:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        action = run.predict(observation)
+        assert env.action_space.contains(action)
+        observation, *_ = env.step(action)
+        assert env.observation_space.contains(observation)

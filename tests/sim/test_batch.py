@@ -1,5 +1,6 @@
 """Episodes of many environments in step: what moves, what is refused or blocked, what is paid."""
 
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,9 @@ from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.env import TangramEnv
-from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.layout import Layout, TokensConfig
 from tangram_sim.motion.actions import chosen_tokens, velocities
+from tangram_tasks.place import Place
 from tests.sim.builders import SEVEN, evaluation_generators, layout_of
 
 pytestmark = pytest.mark.fast
@@ -270,14 +271,15 @@ def test_both_worlds_play_the_same_episodes_while_no_overlap_is_allowed(
     envs[0].close()
 
 
-def test_the_gymnasium_environment_tells_why() -> None:
-    env = TangramEnv(("square", "square"), 2.0**0.5, backend="kinematic", arena=4.0)
-    env.reset(seed=0)
-    lie(env.batch, [BESIDE])
-    *_, info = env.step(np.array([-1.0, (1.5 - 0.73 * SIDE) / 4.0, 0.0, 0.0], dtype=np.float32))
-    assert info["blocked"].startswith(
-        "token 0 would lie on others by 27.000% of its area, at most 20.000% allowed: set it down"
-    )
-    assert "refused" not in info
-    *_, info = env.step(np.array([1.0, 0.1, 0.0, 0.0], dtype=np.float32))
-    assert "blocked" not in info
+def test_a_task_tells_why_nothing_moved() -> None:
+    world = SimConfig(backend="kinematic", arena=4.0)
+    task = Place(TokensConfig(("square", "square"), 2.0**0.5), world, RewardConfig())
+    with closing(task.make(1)) as env:
+        env.reset([np.random.default_rng(0)])
+        lie(env.world, [BESIDE])
+        env.step(np.array([[-1.0, (1.5 - 0.73 * SIDE) / 4.0, 0.0, 0.0]], np.float32))
+        assert env.told()["refused"].startswith(
+            "token 0 would lie on others by 27.000% of its area, at most 20.000% allowed: set it d"
+        )
+        env.step(np.array([[1.0, 0.1, 0.0, 0.0]], np.float32))
+        assert env.told().keys() == {"overlap", "is_success"}

@@ -1,15 +1,12 @@
 """Tokens that a finger pushes: what a push is, where they come, and who learned nothing."""
 
-import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import tangram_sim.world.pushing as table_module
 import tangram_tasks.push.alone as alone_module
@@ -19,7 +16,7 @@ from tangram_core.errors import ConfigError, SamplingError
 from tangram_core.seeding import episode_generator
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.world.pushing import PushTable, Unknowns
-from tangram_tasks.push.gym_env import IDS, PAIR, PushGoalEnv
+from tangram_tasks.goal_env import push as push_env
 from tangram_tasks.push.order import come_next
 from tangram_tasks.push.places import AWAY, corners_of, errors, on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
@@ -240,22 +237,8 @@ def test_wrong_settings_are_refused(settings: dict[str, Any], reason: str) -> No
         replace(SQUARE, config=PushConfig(**settings))
 
 
-@pytest.mark.parametrize("name", IDS)
-def test_gymnasium_checks_it_without_a_warning(name: str) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(name, render_mode="rgb_array", render_size=60)
-        check_env(env.unwrapped)
-        env.reset(seed=0)
-        env.action_space.seed(0)
-        *_, truncated, info = [env.step(env.action_space.sample()) for _ in range(8)][-1]
-    assert truncated == (name == "Push-v0")
-    assert info["is_success"] in (True, False)
-    env.close()
-
-
 def test_compute_reward_is_that_of_the_step() -> None:
-    with closing(PushGoalEnv(PAIR)) as env:
+    with closing(push_env(("square", "small_triangle"))) as env:
         seen, _ = env.reset(seed=3)
         rows = []
         for _ in range(6):
@@ -289,23 +272,8 @@ def test_tokens_without_room_are_refused_before_they_are_played() -> None:
         large.check(plays=True)
 
 
-@pytest.mark.filterwarnings("ignore:.*not in the possible render_modes")  # gymnasium's own
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        ({"count": 0, "shapes": PAIR}, "has 16 pushes, and the id's time limit is 8: give horizon"),
-        ({"render_mode": "3d"}, "render_mode must be None or rgb_array, got '3d'"),
-        ({"render_size": 0}, "render_size must be between 1"),
-        ({"gravity": 1.0}, "gravity"),
-    ],
-)
-def test_gymnasium_refuses_settings_that_cannot_work(settings: dict[str, Any], reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
-        gymnasium.make("Push-v0", **settings)
-
-
 def test_what_is_beyond_the_action_space_is_cut() -> None:
-    with closing(PushGoalEnv()) as env, closing(PushGoalEnv()) as other:
+    with closing(push_env()) as env, closing(push_env()) as other:
         for one in (env, other):
             one.reset(seed=1)
         far, cut = np.array([-3, 0.2, 5, 9], np.float32), np.array([-1, 0.2, 1, 1], np.float32)

@@ -8,11 +8,11 @@ from tangram_lab.benchmarks.measure import Row, Work, compare
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.world.engine import pybullet
 from tangram_sim.world.pushing import _STEP, PushTable
-from tangram_tasks.push.gym_env import SEVEN
 from tangram_tasks.push.places import Push as Pushed
 from tangram_tasks.push.places import begin, corners_of, push_of
 from tangram_tasks.push.task import Push, PushConfig
 from tangram_tasks.push.trials import middle
+from tangram_tasks.register import SEVEN
 
 COUNTS, PUSHES = (1, 2, 7), 64
 

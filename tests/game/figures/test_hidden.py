@@ -12,7 +12,7 @@ import pytest
 import shapely
 from PIL import Image
 
-import tangram_sim.register  # noqa: F401  # registers the environments
+import tangram_tasks.register  # noqa: F401  # registers the environments
 from tangram_core.errors import ConfigError
 from tangram_core.task import Chooser, Env
 from tangram_game.config import EvalConfig

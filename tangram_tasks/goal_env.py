@@ -1,0 +1,182 @@
+"""Any task as a goal environment of gymnasium; `register.py` has the ids.
+
+Legend: A entries of an action, n goals.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from tangram_core.arrays import Bools, Floats, Pixels, Singles
+from tangram_core.errors import ConfigError
+from tangram_core.settings import check_range
+from tangram_core.setup import from_mapping
+from tangram_core.spec import Array, Arrays
+from tangram_core.task import Task
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.geometry.layout import TokensConfig
+from tangram_tasks.place import Place
+from tangram_tasks.push.task import Push, PushConfig
+
+Observation = dict[str, Any]  # of float64 vectors
+
+MAX_SIDE = 4096  # of a picture, pixels
+# The square tan has a quarter of the full square's diagonal as its side: this makes it 0.4.
+SQUARE_SCALE = 0.8 * 2.0**0.5
+
+
+class TaskEnv(gymnasium.Env[Observation, Singles]):
+    """One environment of a task.
+
+    Observations are a dict of float64 vectors: `achieved_goal`, `desired_goal`, and in
+    `observation` all fields of the task's spec but the goal, one after the other. Entries of an
+    action beyond [-1, 1] count as the bound. An episode that does not terminate is truncated after
+    `task.spec.horizon` steps. `info` has `is_success`, and what the task tells of the step.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
+
+    def __init__(self, task: Task, render_mode: str | None = None, render_size: int = 240) -> None:
+        """Make the world.
+
+        Args:
+            task: what is played, such as `load_run(...).setup.task`.
+            render_mode: None or rgb_array.
+            render_size: side of the rendered picture in pixels.
+
+        Raises:
+            ConfigError: a setting that cannot work.
+        """
+        if render_mode not in (None, "rgb_array"):
+            raise ConfigError(f"render_mode must be None or rgb_array, got '{render_mode}'")
+        check_range("render_size", render_size, 1, MAX_SIDE)
+        task.check(plays=True)
+        self.task, self.render_mode, self._size = task, render_mode, render_size
+        self._env, spec = task.make(1), task.spec
+        self._steps, self._ended = spec.horizon, False  # no episode yet
+        self._fields = [one for one in spec.fields if one.name != spec.desired]
+        self.action_space = spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32)
+
+        def box(*names: str) -> spaces.Box:
+            fields = [spec.field(name) for name in names]
+            low, high = (
+                np.concatenate([np.full(int(np.prod(one.shape)), bound) for one, bound in pairs])
+                for pairs in ([(f, f.low) for f in fields], [(f, f.high) for f in fields])
+            )
+            return spaces.Box(low, high, dtype=np.float64)
+
+        self.observation_space = spaces.Dict(
+            {
+                "observation": box(*(one.name for one in self._fields)),
+                "achieved_goal": box(spec.achieved),
+                "desired_goal": box(spec.desired),
+            }
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; a seed fixes this one and all that follow; SamplingError: no room."""
+        super().reset(seed=seed, options=options)
+        seen = self._env.reset([self.np_random])
+        self._steps, self._ended = 0, False
+        return self._observation(seen), {}
+
+    def step(self, action: Singles) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Play one action of shape (A,).
+
+        Raises:
+            ValueError: wrong shape, or not finite.
+            RuntimeError: the episode is over, or none was begun.
+        """
+        spec, size = self.task.spec, self.task.spec.action_size
+        if self._ended or self._steps >= spec.horizon:
+            raise RuntimeError(f"no episode of {spec.horizon} steps goes on: call reset first")
+        given = np.asarray(action, np.float32)
+        if given.shape != (size,) or not np.isfinite(given).all():
+            raise ValueError(f"an action must be {size} finite numbers, got {action!r}")
+        step = self._env.step(np.clip(given, -1.0, 1.0)[None])
+        self._steps, self._ended = self._steps + 1, bool(step.terminated[0])
+        cut = not self._ended and self._steps == spec.horizon
+        info = {"is_success": self._ended, **self._env.told()}
+        return self._observation(step.seen), float(step.rewards[0]), self._ended, cut, info
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:  # noqa: ARG002 - goal environments have it
+        """Of one achieved and one desired goal a float, of n of each their rewards (n,).
+
+        Where rewards are measured on pictures, goals that were never photographed are measured on
+        exact polygons.
+        """
+        rewards: Floats = self.task.rewards(*self._goals(achieved_goal, desired_goal))
+        return float(rewards[0]) if np.ndim(achieved_goal) == 1 else rewards
+
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:  # noqa: ARG002
+        """Whether the last step would have ended the episode, for one goal or for n."""
+        achieved, desired = self._goals(achieved_goal, desired_goal)
+        recorded = np.full(len(achieved), self._ended)
+        ended: Bools = self.task.ended(achieved, desired, recorded)
+        return bool(ended[0]) if np.ndim(achieved_goal) == 1 else ended
+
+    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+        """Whether the time is over and the goal is not reached, for one goal or for n."""
+        ended = self.compute_terminated(achieved_goal, desired_goal, info)
+        return np.logical_not(ended) & (self._steps >= self.task.spec.horizon)
+
+    def render(self) -> Pixels | None:
+        """The scene as (size, size, 3); None without a render mode, or where there is none."""
+        return None if self.render_mode is None else self._env.picture(self._size)
+
+    def close(self) -> None:
+        """Free the engine."""
+        self._env.close()
+
+    def _goals(self, achieved: Array, desired: Array) -> tuple[Floats, Floats]:
+        """Goals (n, ...) of vectors, or rows of them."""
+        shape = self.task.spec.field(self.task.spec.desired).shape
+        return tuple(np.asarray(one, np.float64).reshape(-1, *shape) for one in (achieved, desired))  # type: ignore[return-value]
+
+    def _observation(self, seen: Arrays) -> Observation:
+        """Vectors of their own."""
+        spec = self.task.spec
+        flat = {name: np.array(rows[0], np.float64).ravel() for name, rows in seen.items()}
+        return {
+            "observation": np.concatenate([flat[one.name] for one in self._fields]),
+            "achieved_goal": flat[spec.achieved],
+            "desired_goal": flat[spec.desired],
+        }
+
+
+def place(
+    shapes: Sequence[Any] = ("square",),
+    scale: float = SQUARE_SCALE,
+    reward: str = "overlap",
+    render_mode: str | None = None,
+    render_size: int = 240,
+    **sim: Any,
+) -> TaskEnv:
+    """Tokens that are moved onto their target.
+
+    Args:
+        shapes, scale: of the tokens, see `TokensConfig`; the default makes the square's side 0.4.
+        reward: the name of a reward.
+        render_mode, render_size: see `TaskEnv`.
+        **sim: the fields of `SimConfig`, such as backend="kinematic".
+    """
+    world = from_mapping(SimConfig, sim, "sim")
+    task = Place(TokensConfig(tuple(shapes), scale), world, RewardConfig(name=reward))
+    return TaskEnv(task, render_mode, render_size)
+
+
+def push(
+    shapes: Sequence[Any] = ("square",),
+    scale: float = SQUARE_SCALE,
+    render_mode: str | None = None,
+    render_size: int = 240,
+    **task: Any,
+) -> TaskEnv:
+    """A finger that pushes tokens; as `place`, with the fields of `PushConfig`."""
+    config = from_mapping(PushConfig, task, "task")
+    return TaskEnv(Push(TokensConfig(tuple(shapes), scale), config), render_mode, render_size)

@@ -1,0 +1,31 @@
+"""The ids of gymnasium: after `import tangram_tasks.register`, `gymnasium.make("Push-v0")` works.
+
+Neither the environment nor the engine is loaded before one is made.
+"""
+
+from typing import Any
+
+import gymnasium
+
+SEVEN = (
+    *("large_triangle", "large_triangle", "medium_triangle", "small_triangle", "small_triangle"),
+    *("square", "parallelogram"),
+)
+# Id -> task, and where it differs from what `goal_env` has.
+IDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "Tangram-v0": ("place", {}),  # the paper's task, which pretrained/square plays
+    "Tangram7-v0": (
+        "place",
+        {"shapes": SEVEN, "scale": 0.6, "starts": "outside", "mirrored": 0.5},
+    ),
+    "Push-v0": ("push", {}),
+    "Push2-v0": ("push", {"shapes": ("square", "small_triangle")}),
+    "Push7-v0": ("push", {"shapes": SEVEN, "scale": 0.6}),
+}
+
+
+for _name, (_task, _settings) in IDS.items():
+    if _name not in gymnasium.registry:  # else the module was loaded again
+        gymnasium.register(
+            id=_name, entry_point=f"tangram_tasks.goal_env:{_task}", kwargs=_settings
+        )
