@@ -19,7 +19,8 @@ from tangram_sim.geometry.overlap import shared_areas
 from tangram_tasks.push.places import on_table
 
 DIRECTIONS = 48
-MOVED = 0.05, 0.15  # how far a token is moved to see what is in its way
+MOVED = 0.05, 0.15  # how far a token of mean radius RADIUS is moved to see what is in its way
+RADIUS = 0.22278013147330306  # of the seven tans of tokens=tangram7
 ASIDE = 0.02  # share of a token that may come over another: it is pushed aside a little
 ROOMY = 20  # directions that are enough: 150 degrees
 MOST = 10  # tokens that are put in order
@@ -73,7 +74,8 @@ def _orders(layout: Layout, goals: bytes) -> tuple[Ints, Ints]:
 def _free(layout: Layout, corners: Floats, tokens: Ints) -> Bools:
     """(n, n, D) in which directions one of tokens (n,) gets out of its place past another."""
     outlines = corners[layout.padded_corners[tokens]]
-    ways = np.exp(2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)[:, None] * np.array(MOVED)
+    far = np.array(MOVED) * (layout.radii.mean() / RADIUS)
+    ways = np.exp(2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)[:, None] * far
     steps = np.stack([ways.real, ways.imag], axis=-1).reshape(-1, 1, 1, 2)
     places = np.broadcast_to(outlines, (len(steps), *outlines.shape))
     over = shared_areas(outlines + steps, places).reshape(DIRECTIONS, len(MOVED), len(tokens), -1)

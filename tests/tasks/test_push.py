@@ -294,8 +294,9 @@ def test_what_pictures_show_is_near_and_equal_tokens_keep_their_names() -> None:
             seen = env.step(rng.uniform(-1.0, 1.0, (4, 4)).astype(np.float32)).seen
 
 
-def test_the_middle_of_a_row_comes_before_its_second_end() -> None:
-    layout = Push(TokensConfig(("square", "square", "square"), 0.8), PushConfig(count=3)).layout
+@pytest.mark.parametrize("scale", [0.8, 0.05])
+def test_the_middle_of_a_row_comes_before_its_second_end(scale: float) -> None:
+    layout = Push(TokensConfig(("square", "square", "square"), scale), PushConfig(count=3)).layout
     side = float(np.ptp(layout.body[:4, 0]))
     goals = layout.corners(np.array([[-side, 0.0, 0.0], [0.0, 0.0, 0.0], [side, 0.0, 0.0]]))
     away = np.array([[-0.7, 0.7, 0.0], [0.0, 0.7, 0.0], [0.7, 0.7, 0.0]])
@@ -309,7 +310,7 @@ def test_the_middle_of_a_row_comes_before_its_second_end() -> None:
         lies = np.array(placed, np.bool_)
         found = come_next(layout, layout.corners(away), goals, lies)
         assert found.astype(int).tolist() == following
-    poses = np.array([[-side, 0.0, 0.0], [0.7, 0.7, 0.0], [side / 2.0, 0.1, 0.0]])
+    poses = np.array([[-side, 0.0, 0.0], [0.7, 0.7, 0.0], [side / 2.0, 0.35 * side, 0.0]])
     found = come_next(layout, layout.corners(poses), goals, np.array([True, False, False]))
     assert found.tolist() == [False, True, True]  # the last lies in the middle
 
