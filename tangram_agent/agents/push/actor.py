@@ -156,15 +156,15 @@ class PushActor(NetworkActor):
     def _trials(self) -> Trials:
         return Trials(self._task)
 
-    def _drawn(self, count: int, explore: Generators | None) -> tuple[torch.Tensor, Singles]:
+    def _drawn(self, count: int, explore: Generators | None) -> tuple[torch.Tensor, Floats]:
         """(B * K, P) pushes to look at, and three numbers (B, 3) in [0, 1) for each environment."""
         each = self._task.count
         if explore is None:  # all of them, always in the same order
-            return _all_pushes(count * each), np.ones((count, 3), np.float32)
+            return _all_pushes(count * each), np.ones((count, 3))
         size = (each, 2 * self._config.looked_at)
         drawn = [(one.integers(PUSHES, size=size), one.random(3)) for one in explore]
         pushes, numbers = (np.stack(part) for part in zip(*drawn, strict=True))
-        return torch.from_numpy(pushes.reshape(count * each, -1)), numbers.astype(np.float32)
+        return torch.from_numpy(pushes.reshape(count * each, -1)), numbers  # singles may be 1
 
 
 def _made_here(corners: Array, actions: Floats, past: History) -> Bools:

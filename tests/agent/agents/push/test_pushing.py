@@ -16,6 +16,7 @@ from tangram_agent.agents.push.choosing import Search
 from tangram_agent.agents.push.learner import Batch, PushLearner, PushReplay
 from tangram_agent.agents.push.scenes import PUSHES, Scene, Tokens, distance, gap, rotated
 from tangram_agent.agents.push.seen import beside, pushes, seen_by
+from tangram_agent.runs import beginning
 from tangram_core.agent import Learner
 from tangram_core.conformance import check_agent, play
 from tangram_core.errors import ConfigError
@@ -275,6 +276,21 @@ def test_tokens_that_are_not_next_are_pushed_only_where_no_other_can_be() -> Non
     found.poses[0, 1:, 0] = found.poses[2, 1:, 0] = 1.5  # out of the finger's reach
     _, slots, _ = actor._best(found, actor._pairs(found), search)
     assert [set(row) for row in slots.tolist()] == [{0}, {0}] * 2
+
+
+def test_the_largest_random_number_names_the_last_token_and_push() -> None:
+    class Largest(np.random.Generator):
+        def random(self, size: int) -> np.ndarray:  # type: ignore[override]
+            return np.full(size, np.nextafter(1.0, 0.0))
+
+    actor = Pushing(replace(SMALL, uniform_share=1.0)).actor(SOME)
+    assert isinstance(actor, PushActor)
+    actor.load(Pushing(SMALL).learner(SOME, 0, "cpu").broadcast())
+    with closing(SOME.make(1)) as env:
+        seen = env.reset(generators("test", 0, 1))
+    action = actor.act(seen, beginning(SOME.spec, seen), [Largest(np.random.PCG64(0))])
+    last = np.flatnonzero(on_table(seen["goals"], SOME.layout)[0])[-1]
+    np.testing.assert_array_equal(action[0], actor._tokens.actions[last, -1].astype(np.float32))
 
 
 def test_that_token_is_pushed_that_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
