@@ -25,10 +25,15 @@ def with_named_code(arguments: Sequence[str]) -> list[str]:
 
 def without_named_code(arguments: Sequence[str]) -> list[str]:
     """For a command that plays trained runs, which have a task and an agent already."""
-    names = [one.lstrip("+").partition("=")[0] for one in arguments]
-    kinds = {f"{role}.{KIND}" for role in ROLES}
-    named = zip(names, arguments, strict=True)
-    return [one for name, one in named if not names_modules(name) and name not in kinds]
+    kinds = {f"{role}.{KIND}": role for role in ROLES}
+
+    def brought(argument: str) -> bool:
+        name, _, value = argument.lstrip("+").partition("=")
+        plain, role = unquoted(value), kinds.get(name)
+        own = role is not None and (own_code(plain) is not None or plain in announced(role))
+        return own or names_modules(name)
+
+    return [one for one in arguments if not brought(one)]
 
 
 def _named(argument: str) -> str:

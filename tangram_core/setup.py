@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
-from typing import Any, TypeVar, cast, get_origin, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import dacite
 
@@ -21,7 +21,7 @@ from tangram_core.registry import (
     named,
 )
 from tangram_core.run.code import KIND
-from tangram_core.settings import KEY, NETWORK, Settings, declared_fields
+from tangram_core.settings import KEY, NETWORK, Settings, declared_fields, told
 from tangram_core.spec import EpisodeSpec
 from tangram_core.task import Task
 
@@ -205,7 +205,19 @@ def from_mapping(kind: type[Made], mapping: Mapping[str, Any], section: str = ""
     except dacite.DaciteError as error:
         if section and isinstance(error, dacite.DaciteFieldError):
             error.update_path(section)
+        if isinstance(error, dacite.WrongTypeError):
+            wanted = _wanted(cast("Any", error.field_type))
+            got = told(error.value)
+            raise ConfigError(f"{error.field_path} must be {wanted}, got {got}") from None
         raise ConfigError(f"wrong config: {error}") from None
+
+
+def _wanted(kind: Any) -> str:
+    """A type in plain words."""
+    if get_origin(kind) is tuple:
+        return f"a list, each {_wanted(get_args(kind)[0])}"
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+    return words.get(kind, str(kind))
 
 
 def _check_names(kind: type[Any], mapping: Mapping[str, Any], group: str) -> None:

@@ -96,10 +96,13 @@ def _with_figures(settings: Plain) -> Plain:
         return settings
     if settings.get("sheet") or settings["turns"] != 1 or Path(puzzle[0]).suffix:
         raise ConfigError(
-            "task=push makes figures of the library, at an angle of each episode: give the name "
-            "of one alone, as in puzzle=cat, without turns, sheet or file"
+            "task=push makes figures of the library, at an angle of each episode: give names "
+            "alone, as in puzzle=cat or [cat,dog], without turns, sheet or file"
         )
-    own = changes.get("task", {}) | {"puzzle": list(puzzle)}
+    own = changes.get("task", {})
+    if "puzzle" in own:
+        raise ConfigError("puzzle= is task.puzzle= of such a run: leave one of both out")
+    own = own | {"puzzle": list(puzzle)}
     return settings | {"puzzle": None, "changes": changes | {"task": own}}
 
 

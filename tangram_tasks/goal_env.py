@@ -3,8 +3,10 @@
 Legend: A entries of an action, n goals.
 """
 
+import math
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -52,7 +54,7 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         """
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode must be None or rgb_array, got '{render_mode}'")
-        check_range("render_size", render_size, 1, MAX_SIDE)
+        check_range("render_size", operator.index(render_size), 1, MAX_SIDE)
         task.check(plays=True)
         self.task, self.render_mode, self._size = task, render_mode, render_size
         self._env, spec = task.make(1), task.spec
@@ -107,8 +109,8 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:  # noqa: ARG002 - goal environments have it
         """Of one achieved and one desired goal a float, of n of each their rewards (n,).
 
-        Where rewards are measured on pictures, goals that were never photographed are measured on
-        exact polygons.
+        A step's reward may be measured on pictures; this one is measured on the corners that are
+        seen, so with pictures both differ by a little.
         """
         rewards: Floats = self.task.rewards(*self._goals(achieved_goal, desired_goal))
         return float(rewards[0]) if np.ndim(achieved_goal) == 1 else rewards
@@ -133,10 +135,25 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         """Free the engine."""
         self._env.close()
 
+    def __getstate__(self) -> NoReturn:
+        """Refuse copies: two environments would move the tokens of one engine."""
+        raise TypeError("an environment holds an engine and cannot be copied: make another one")
+
     def _goals(self, achieved: Array, desired: Array) -> tuple[Floats, Floats]:
-        """Goals (n, ...) of vectors, or rows of them."""
-        shape = self.task.spec.field(self.task.spec.desired).shape
-        return tuple(np.asarray(one, np.float64).reshape(-1, *shape) for one in (achieved, desired))  # type: ignore[return-value]
+        """Goals (n, ...) of vectors, or of n rows of them.
+
+        Raises:
+            ValueError: they have other shapes, or are not as many.
+        """
+        spec, rows = self.task.spec, np.shape(achieved)[:-1]
+        goals = [np.asarray(one, np.float64) for one in (achieved, desired)]
+        shapes = [spec.field(name).shape for name in (spec.achieved, spec.desired)]
+        for goal, shape in zip(goals, shapes, strict=True):
+            wanted = (*rows, math.prod(shape))
+            if goal.shape != wanted or len(rows) > 1:
+                raise ValueError(f"a goal must have shape {wanted[-2:]}, got {goal.shape}")
+        first, second = (g.reshape(-1, *s) for g, s in zip(goals, shapes, strict=True))
+        return first, second
 
     def _observation(self, seen: Arrays) -> Observation:
         """Vectors of their own."""
@@ -166,7 +183,7 @@ def place(
         **sim: the fields of `SimConfig`, such as backend="kinematic".
     """
     world = from_mapping(SimConfig, sim, "sim")
-    task = Place(TokensConfig(tuple(shapes), scale), world, RewardConfig(name=reward))
+    task = Place(_tokens(shapes, scale), world, RewardConfig(name=reward))
     return TaskEnv(task, render_mode, render_size)
 
 
@@ -179,4 +196,8 @@ def push(
 ) -> TaskEnv:
     """A finger that pushes tokens; as `place`, with the fields of `PushConfig`."""
     config = from_mapping(PushConfig, task, "task")
-    return TaskEnv(Push(TokensConfig(tuple(shapes), scale), config), render_mode, render_size)
+    return TaskEnv(Push(_tokens(shapes, scale), config), render_mode, render_size)
+
+
+def _tokens(shapes: Sequence[Any], scale: float) -> TokensConfig:
+    return from_mapping(TokensConfig, {"shapes": shapes, "scale": scale}, "tokens")

@@ -446,6 +446,7 @@ def test_entry_does_not_hide_a_fault_of_ours(entered: Entered) -> None:
         (f"train seed={'[' * 3000}{']' * 3000}", "nested too deeply: write fewer brackets"),
         ("eval run_dir=x sim=kinematic", "sim=kinematic chooses a preset, and a trained run has"),
         ("eval run_dir=x tokens=square", "unknown setting 'tokens' (a trained run keeps its own)"),
+        ("eval run_dir=x task.kind=place", "unknown setting 'task.kind' ("),
         ("train seed=\x1b[1m", "cannot read 'seed=\\x1b[1m': write name=value"),
         ("train sim=[physics,kinematic]", "sim takes one preset, got [physics,kinematic]"),
         ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),

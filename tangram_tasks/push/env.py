@@ -33,7 +33,8 @@ class PushEnv(Env):
     def __init__(self, task: "Push", count: int, fewer: Sequence[float] = ()) -> None:
         """Set up the tables; weights of 1, 2, ... tokens, none: as many as the task has."""
         self.count, self._task = count, task
-        self._fewer = np.array(fewer) / (sum(fewer) or 1.0)
+        some = np.array(fewer[: task.count])
+        self._fewer = some / some.sum() if some.any() else some[:0]
         self.tables = [PushTable(task.layout, task.config.finger) for _ in range(count)]
         self.arms = [Panda() for _ in range(count if task.config.hand == "panda" else 0)]
         shape = (count, task.layout.corner_count, 2)

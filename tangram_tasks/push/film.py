@@ -35,6 +35,9 @@ class Replayed:
         self.task, self.corners, self.goals = task, facts["corners"], facts["goals"][0]
         self.present = on_table(self.goals, task.layout)
         self.actions = played.episodes.actions[episode]
+        self.shown = self.corners  # by which it was pushed
+        if task.config.pixels:
+            self.shown = played.episodes["corners"][episode].astype(np.float64)
         ended = played.episodes.terminated[episode].astype(bool)
         self.count = int(ended.argmax()) + 1 if ended.any() else len(ended)
         names = ("table", "spread", "finger", "centres")
@@ -43,8 +46,8 @@ class Replayed:
 
     def push(self, number: int) -> Push | None:
         """Which push was tried; None: the finger could not come down."""
-        config, corners = self.task.config, self.corners[number]
-        given = corners, self.actions[number], config.finger, config.longest
+        config = self.task.config
+        given = self.shown[number], self.actions[number], config.finger, config.longest
         push = push_of(self.task.layout, *given)
         return None if push.refused else push
 

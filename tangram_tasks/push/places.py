@@ -172,7 +172,7 @@ def figures_of(layout: Layout, scale: float, named: Sequence[str]) -> Iterator[F
     Raises:
         ConfigError: there is no such figure, it has other pieces, or the table is too small.
     """
-    known = {split: library(split, scale) for split in ("train", "test")}
+    known = {split: library(split, scale) for split in ("train", "test") if named}
     known |= {one.name: (one,) for of_split in [*known.values()] for one in of_split}
     for name in named:
         if name not in known:

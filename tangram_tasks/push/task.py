@@ -153,7 +153,7 @@ class Push(Task):
         if named and self.count < self.layout.tokens:
             raise ConfigError(
                 f"task.puzzle needs all seven tans on the table, got task.count={self.count}: set "
-                "task.count=0, and play an agent that was trained so"
+                "task.count=0, or leave puzzle out"
             )
         return tuple(figures_of(self.layout, self.tokens.scale, named))
 
@@ -192,7 +192,7 @@ class Push(Task):
     def check(self, *, plays: bool) -> None:
         """Refuse tokens without room, weights of none, and to play where there is no engine."""
         fewer = self.config.fewer
-        if fewer and (len(fewer) > self.count or not sum(fewer)):
+        if not plays and fewer and (len(fewer) > self.count or not sum(fewer)):
             raise ConfigError(
                 f"task.fewer={told(fewer)} must have at most {self.count} weights, of 1, 2, ... "
                 f"tokens, and one above 0: write it as {told((1,) * self.count)}"

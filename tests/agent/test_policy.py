@@ -349,7 +349,7 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
     ("section", "name", "value", "reason"),
     [
         ("agent", "reapply", -1, "run with agent.reapply=-1: agent.reapply must be between 0 and"),
-        ("agent", "reapply", "x", "wrong config: .*agent.reapply"),
+        ("agent", "reapply", "x", "agent.reapply must be a whole number, got x"),
         ("agent", "odd", 1, "there is no setting agent.odd"),
         ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
         ("agent", "kind", "scene", "agent.kind=scene does not fit .*kind=pair: leave"),

@@ -147,5 +147,8 @@ def test_an_agent_plays_the_environment_of_its_task(name: str) -> None:
         assert env.observation_space.contains(observation)
         action = run.predict(observation)
         assert env.action_space.contains(action)
-        observation, *_ = env.step(action)
+        observation, reward, *_ = env.step(action)
         assert env.observation_space.contains(observation)
+        goals = observation["achieved_goal"], observation["desired_goal"]
+        near = 0.05 if "pictures" in name else 1e-6
+        assert env.compute_reward(*goals, {}) == pytest.approx(reward, abs=near)

@@ -21,6 +21,7 @@ from tangram_tasks.push.order import come_next
 from tangram_tasks.push.places import AWAY, corners_of, errors, on_table, push_of
 from tangram_tasks.push.task import Push, PushConfig
 from tangram_tasks.push.trials import middle
+from tangram_tasks.register import SEVEN
 
 pytestmark = pytest.mark.fast
 
@@ -208,7 +209,7 @@ def test_weights_of_no_tokens_are_refused_where_it_learns(weights: tuple[float, 
     with pytest.raises(
         ConfigError, match="task.fewer=.* must have at most 1 weights, of 1, 2, ... tokens, and one"
     ):
-        replace(SQUARE, config=PushConfig(fewer=weights)).check(plays=True)
+        replace(SQUARE, config=PushConfig(fewer=weights)).check(plays=False)
 
 
 def test_it_learns_from_fewer_tokens_too_and_is_tested_with_all() -> None:
@@ -313,6 +314,16 @@ def test_the_middle_of_a_row_comes_before_its_second_end(scale: float) -> None:
     poses = np.array([[-side, 0.0, 0.0], [0.7, 0.7, 0.0], [side / 2.0, 0.35 * side, 0.0]])
     found = come_next(layout, layout.corners(poses), goals, np.array([True, False, False]))
     assert found.tolist() == [False, True, True]  # the last lies in the middle
+
+
+def test_weights_of_more_tokens_than_there_are_are_for_learning_alone() -> None:
+    two = Push(TokensConfig(SEVEN, 0.6), PushConfig(count=2, fewer=(0.0, 0.0, 1.0)))
+    two.check(plays=True)
+    with closing(two.make(2)) as env:
+        seen = env.reset(generators(2))
+    assert (on_table(seen["goals"], two.layout).sum(axis=1) == 2).all()
+    with pytest.raises(ConfigError, match="task.fewer=.0,0,1. must have at most 2 weights"):
+        two.check(plays=False)
 
 
 def test_layouts_that_find_room_now_and_then_are_refused() -> None:

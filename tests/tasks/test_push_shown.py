@@ -20,6 +20,7 @@ from tangram_core.task import Played
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.puzzles.figures import library
 from tangram_sim.world.arm import LIFTED, LOWERED, METRES, Motion, Panda
+from tangram_tasks.push.env import PushEnv
 from tangram_tasks.push.film import PARTS, Replayed, from_the_side
 from tangram_tasks.push.places import figures_of
 from tangram_tasks.push.rivals import Planner
@@ -118,6 +119,24 @@ def test_a_film_has_the_way_of_every_push_and_ends_where_it_was_recorded() -> No
     np.testing.assert_allclose(found[-1], one.corners[1], atol=1e-9)
 
 
+def test_a_plan_from_pictures_has_the_pushes_that_were_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task, made = replace(TWO, config=replace(TWO.config, pixels=32)), list[np.ndarray]()
+    push = PushEnv._push
+
+    def noted(env: PushEnv, b: int, begin: np.ndarray, way: np.ndarray) -> str:
+        made.append(np.concatenate([begin, way]))
+        return push(env, b, begin, way)
+
+    monkeypatch.setattr(PushEnv, "_push", noted)
+    one = Replayed(task, by_planner(task), 0)
+    again = [push for push in map(one.push, range(one.count)) if push is not None]
+    assert len(again) > 3
+    found = np.array([[*push.begin, *push.way] for push in again])
+    np.testing.assert_allclose(found, made, atol=1e-6)
+
+
 def test_a_film_of_an_arm_and_a_plan_with_its_joints(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tangram_tasks.push.film.FRAMES", 12)
     played = by_planner(HELD)
@@ -201,7 +220,11 @@ def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
     status, _, err = here("tangram-play", *told[:1], "puzzle=dodo", cwd=tmp_path)
     assert status == 2
     assert "no puzzle 'dodo': choose from" in err
-    for wrong, reason in (("turns=2", "without turns"), ("task.count=2", "needs all seven")):
+    for wrong, reason in (
+        ("turns=2", "without turns"),
+        ("task.count=2", "needs all seven"),
+        ("task.puzzle=[dog]", "leave one of both out"),
+    ):
         status, _, err = here("tangram-play", *told, wrong, cwd=tmp_path)
         assert (status, reason in err) == (2, True), err
 
