@@ -10,7 +10,7 @@ from typing import Any
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_core.errors import ConfigError
 from tangram_core.settings import Settings, check_folder, refuse_ignored, setting, told
-from tangram_sim.config import SILHOUETTES
+from tangram_sim.config import SILHOUETTE
 from tangram_sim.puzzles.figures import SPLITS
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
@@ -109,7 +109,7 @@ class EvalConfig(Settings):
         if self.puzzle is not None:
             _refuse(self.changes, OF_TARGETS, "puzzle", "leave puzzle out")
         observe = self.changes.get("sim", {}).get("observe")
-        if self.puzzle is None and observe in SILHOUETTES:
+        if self.puzzle is None and observe == SILHOUETTE:
             raise ConfigError(
                 f"sim.observe={observe} hides the pieces of puzzles, got none: add puzzle=test"
             )

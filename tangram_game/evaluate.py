@@ -31,10 +31,9 @@ from tangram_game.scores import (
     of_outlines,
     of_several,
     score_hidden,
-    score_pictured,
     score_puzzles,
 )
-from tangram_sim.config import SILHOUETTES, SimConfig
+from tangram_sim.config import SILHOUETTE, SimConfig
 from tangram_sim.drawing.game_drawing import figure_sheet
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
@@ -137,12 +136,9 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     source, names = source_and_names(config.puzzle or ())
     task = run.task
     figures = find_figures(source, task, names, config.turns)
-    if task.outlines and task.sim.observe == "silhouette_pictures":
-        scored = score_pictured(run, figures, config.seed)
-    else:
-        hides = task.sim.observe in SILHOUETTES and not task.outlines
-        score = score_hidden if hides else score_puzzles
-        scored = score(task, figures, policies(run, config.rivals), config.seed, run.actor.at_once)
+    hides = task.sim.observe == SILHOUETTE and not task.outlines
+    score = score_hidden if hides else score_puzzles
+    scored = score(task, figures, policies(run, config.rivals), config.seed, run.actor.at_once)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(figures)

@@ -4,12 +4,11 @@ Legend: E puzzles, K tokens, V corners.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tangram_agent.runs import Run
 from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
@@ -18,7 +17,6 @@ from tangram_sim.rewards import scaled_overlap
 from tangram_tasks.metrics import SOLVED, Assembled, assembled, pose_errors, summarise
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
-from tangram_tasks.rivals.baselines import exact_policy
 
 if TYPE_CHECKING:  # needs OpenCV and shapely
     from tangram_game.figures.hidden import Hidden, Laid
@@ -114,28 +112,6 @@ def score_hidden(
     hidden = hide(task, figures, together(task.layout))
     laid = {name: play_hidden(hidden, player, seed, at_once) for name, player in players.items()}
     return _of_hidden({name: (hidden, own) for name, own in laid.items()})
-
-
-def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
-    """Scores of an agent of outlines that is shown pictures, and of who fills them otherwise.
-
-    What each finds is laid alike, by the formula: the motion of tokens that are lifted is known.
-
-    Raises:
-        ConfigError: OpenCV or shapely is not installed.
-    """
-    task = run.task
-    try:
-        from tangram_game.figures.hidden import hide, play_hidden  # noqa: PLC0415
-        from tangram_game.figures.methods import learned_method  # noqa: PLC0415
-        from tangram_vision.silhouettes.silhouettes import UNLEARNED  # noqa: PLC0415
-    except ImportError as error:
-        raise _no_library(task, error) from error
-    own, policy = learned_method(run), exact_policy(task.layout, task.sim)
-    methods = {RUN: own, "largest first": replace(own, values=None), "search": UNLEARNED}
-    every = {name: hide(task, figures, method) for name, method in methods.items()}
-    laid = {name: play_hidden(hidden, lambda _: policy, seed) for name, hidden in every.items()}
-    return _of_hidden({name: (hidden, laid[name]) for name, hidden in every.items()})
 
 
 def _of_hidden(every: "Mapping[str, tuple[Hidden, Laid]]") -> Scored:

@@ -173,7 +173,6 @@ class BatchedEnv:
         self,
         generators: Sequence[np.random.Generator],
         targets: Sides | None = None,
-        known: bool = False,
         starts: Starts | None = None,
     ) -> None:
         """Begin an episode in every environment: a new target and a new start.
@@ -181,8 +180,6 @@ class BatchedEnv:
         Args:
             generators: one per environment; all of the episode's randomness comes from it.
             targets: poses (B, K, 3) and sides (B, K) to assemble; None: they are drawn.
-            known: whether targets that are given were seen before; then in the camera's pictures
-                only the tokens are looked for.
             starts: where tokens lie, and which are placed already, but in pictures, where alike
                 tokens have no names; None: they are drawn, and none is placed.
 
@@ -198,7 +195,7 @@ class BatchedEnv:
             none = np.zeros((self.count, self.layout.tokens), np.bool_)
             starts = Starts(*sample_starts(self.layout, self.sim, targets, generators), none)
         self._generators = generators
-        self._begin(targets, starts, known)
+        self._begin(targets, starts)
         if self.sim.observe == "silhouette":
             self.seen_goals = self._outlined()
         elif self.sight is None:
@@ -275,7 +272,7 @@ class BatchedEnv:
         covered: Floats = common.sum(axis=1) / layout.areas[tokens]
         return covered
 
-    def _begin(self, targets: Sides, starts: Starts, known: bool) -> None:
+    def _begin(self, targets: Sides, starts: Starts) -> None:
         """Photograph the targets and put the tokens at their starts."""
         # World after world, here and in `_move`: the engine's memory of each fills the cache.
         pictures = []
@@ -288,8 +285,7 @@ class BatchedEnv:
             self._targets = TargetPictures(np.stack(pictures))
         if self.sight is not None:
             self.pictures = np.stack([world.picture() for world in self._worlds])
-            goals = self.goals if known else None
-            self.sight.begin(np.stack(pictures), self.pictures, goals)
+            self.sight.begin(np.stack(pictures), self.pictures)
 
     def _move(self, tokens: Ints, velocity: Floats, flip: Bools, idle: Bools) -> Floats | None:
         """Move in every world; (B,) Eq. 14 of the pictures with the camera on."""

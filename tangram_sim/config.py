@@ -14,10 +14,8 @@ REWARDS = ("overlap", "dense")
 SOURCES = ("polygon", "camera")
 MIN_PIXELS = 16
 PICTURES = ("binary", "grey")
-# What the target looks like without its pieces.
-SILHOUETTES = ("silhouette", "silhouette_pictures")
-OBSERVED = ("corners", "pictures", *SILHOUETTES)
-LOOKED_AT = ("pictures", "silhouette_pictures")
+SILHOUETTE = "silhouette"  # what the target looks like without its pieces
+OBSERVED = ("corners", "pictures", SILHOUETTE)
 # The settings of the camera.
 CAMERA = ("pixels", "picture")
 MOTIONS = ("lift", "slide")
@@ -44,8 +42,7 @@ class SimConfig(Settings, section="sim"):
         "what agents see: corners as they are, or what is found in the camera's pictures; then "
         "Eq. 14 is measured on pictures, too, and scores are exact polygons all the same; "
         "silhouette: of the target only its outline, which agent=outline fills itself and others "
-        "have filled by a search; silhouette_pictures: the camera's picture of that, in "
-        "tangram-eval puzzle= alone",
+        "have filled by a search",
         choices=OBSERVED,
     )
     motion: str = setting(
@@ -91,7 +88,7 @@ class SimConfig(Settings, section="sim"):
     @property
     def looks(self) -> bool:
         """Whether agents see nothing but the camera's pictures."""
-        return self.observe in LOOKED_AT
+        return self.observe == "pictures"
 
     @property
     def blind(self) -> "SimConfig":
@@ -116,7 +113,7 @@ class SimConfig(Settings, section="sim"):
         if 0 < self.pixels < MIN_PIXELS:
             raise ConfigError(f"sim.pixels must be 0 or at least {MIN_PIXELS}, got {self.pixels}")
         if self.observe == "silhouette" and self.pixels:
-            remedy = "set sim.observe=silhouette_pictures"
+            remedy = "set sim.observe=pictures"
             refuse_ignored(f"sim.pixels={self.pixels}", "sim.observe=silhouette", remedy, 0)
 
     def _check_observed(self) -> None:

@@ -40,15 +40,10 @@ class PlaceEnv(Env):
         )
         self._result: StepResult | None = None
 
-    def reset(
-        self,
-        generators: Generators,
-        targets: Sides | None = None,
-        known: bool = False,
-    ) -> Arrays:
+    def reset(self, generators: Generators, targets: Sides | None = None) -> Arrays:
         """Begin an episode in every environment; see `BatchedEnv.reset`."""
         self._result = None
-        self.world.reset(generators, targets, known)
+        self.world.reset(generators, targets)
         return self._seen()
 
     def step(self, actions: Singles) -> Step:

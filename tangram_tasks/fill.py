@@ -12,7 +12,7 @@ from tangram_core.scores import Score
 from tangram_core.settings import refuse_ignored, told
 from tangram_core.spec import Array
 from tangram_core.task import Chooser, Env, Played
-from tangram_sim.config import SILHOUETTES, RewardConfig
+from tangram_sim.config import SILHOUETTE, RewardConfig
 from tangram_sim.rewards import scaled_overlap
 from tangram_tasks.place import SEVERAL, Place
 
@@ -68,7 +68,7 @@ class Fill(Place):
             )
         super().__post_init__()
         sim = self.sim
-        if sim.observe not in SILHOUETTES:
+        if sim.observe != SILHOUETTE:
             raise ConfigError(
                 f"task=fill shows outlines, got sim.observe={sim.observe}: set sim=silhouette, or "
                 "task=place"

@@ -7,7 +7,7 @@ Legend: E puzzles, F of them for which something was found, K tokens, V corners.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,20 +17,14 @@ from tangram_core.arrays import Floats, Ints
 from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_game.figures.silhouettes import SECONDS
 from tangram_sim.config import SimConfig
-from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import overlap_share
-from tangram_sim.motion.kinematics import wrap
 from tangram_tasks.metrics import SOLVED, iou
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
-from tangram_vision.pictures.levels import coverage
-from tangram_vision.silhouettes.portraits import portrait
-from tangram_vision.silhouettes.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes.silhouettes import (
     UNLEARNED,
-    Filled,
     Method,
     fill_outline,
     silhouette,
@@ -45,7 +39,7 @@ class Search:
 
     Attributes:
         laid: where the tokens are to be laid; None where nothing was found.
-        iou: of what was found with what was shown: an outline, or a picture's pixels.
+        iou: of what was found with the outline.
         seconds: that it took.
         by: what found it, the search or the beam; empty where nothing was found.
     """
@@ -69,13 +63,11 @@ class Hidden:
         task: the task, as a player of what was found sees it.
         figures: E, with the pieces that nobody is shown.
         searches: E.
-        pictured: whether pictures were shown, not outlines.
     """
 
     task: Place
     figures: tuple[Figure, ...]
     searches: tuple[Search, ...]
-    pictured: bool
 
     @property
     def filled_by(self) -> dict[str, int]:
@@ -137,51 +129,23 @@ def hide(task: Place, figures: Sequence[Figure], method: Method = UNLEARNED) -> 
     """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
 
     Args:
-        task: with `sim.observe` one of `SILHOUETTES`.
+        task: with `sim.observe=silhouette`.
         figures: E puzzles.
         method: how they are filled.
     """
-    layout, sim, shown = task.layout, task.sim, tuple(figures)
-    if sim.observe == "silhouette":
-        searches = tuple(_outline_search(layout, figure, method) for figure in shown)
-        return Hidden(_seeing(task, "corners"), shown, searches, pictured=False)
-    searches = tuple(_picture_search(layout, sim, figure, method) for figure in shown)
-    return Hidden(_seeing(task, "pictures"), shown, searches, pictured=True)
+    searches = tuple(_search(task.layout, figure, method) for figure in figures)
+    # Which targets training drew does not matter.
+    seen = task.with_sim(observe="corners", targets=SimConfig.targets)
+    return Hidden(seen, tuple(figures), searches)
 
 
-def _seeing(task: Place, observe: str) -> Place:
-    """The task of who sees what was found; which targets training drew does not matter."""
-    sim = replace(task.sim, observe=observe, targets=SimConfig.targets)
-    if task.outlines:  # who lays it sees pieces
-        return Place(task.tokens, sim, task.reward)
-    return replace(task, sim=sim)
-
-
-def _outline_search(layout: Layout, figure: Figure, method: Method) -> Search:
-    (filled,) = fill_outline(_silhouette(layout, figure), layout, SECONDS, method=method)
-    return _search(figure, filled, np.zeros(3))
-
-
-def _picture_search(layout: Layout, sim: SimConfig, figure: Figure, method: Method) -> Search:
-    cover = coverage(portrait(_silhouette(layout, figure), sim))
-    if cover is None:  # nothing is to be seen
-        return Search(None, 0.0, 0.0, "")
-    corner = np.array([-sim.arena / 2.0, sim.arena / 2.0, 0.0])  # from which it is measured
-    filled = fill_picture(cover, layout, sim.arena, SECONDS, method)
-    return _search(figure, filled, corner)
-
-
-def _silhouette(layout: Layout, figure: Figure) -> Area:
-    return silhouette(layout, Dissection(figure.poses, figure.flipped))
-
-
-def _search(figure: Figure, filled: Filled, corner: Floats) -> Search:
+def _search(layout: Layout, figure: Figure, method: Method) -> Search:
     """What was found, by the name that decides where tokens start."""
+    outline = silhouette(layout, Dissection(figure.poses, figure.flipped))
+    (filled,) = fill_outline(outline, layout, SECONDS, method=method)
     found, laid = filled.found, None
     if found is not None:
-        poses = found.poses + corner
-        poses[:, 2] = wrap(poses[:, 2])
-        laid = Figure(figure.name, figure.degrees, poses, found.flipped)
+        laid = Figure(figure.name, figure.degrees, found.poses, found.flipped)
     return Search(laid, filled.iou, filled.seconds, filled.by if laid else "")
 
 
@@ -204,4 +168,4 @@ def play_hidden(hidden: Hidden, player: Player, seed: int, at_once: int = AT_ONC
 def lay(hidden: Hidden, player: Player, seed: int, at_once: int = AT_ONCE) -> Played:
     """Lay what was found, F episodes; the targets are what was found, too."""
     laid = [search.laid for search in hidden.searches if search.laid is not None]
-    return play_figures(hidden.task, laid, player, seed, known=hidden.pictured, at_once=at_once)
+    return play_figures(hidden.task, laid, player, seed, at_once=at_once)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:  # needs torch
     from torch import nn
 
     from tangram_agent.agents.outline.actor import OutlineActor
-    from tangram_agent.agents.outline.agent import Outline
     from tangram_agent.agents.outline.filler import Fillable
 
 JUDGE = f"{PREFIX}/tangram7_silhouette"
@@ -51,14 +50,6 @@ def together(layout: Layout) -> Method:
     learned = [shape.name for shape in read_changed(JUDGE, {}).task.layout.shapes]
     known = [shape.name for shape in layout.shapes] == learned
     return Method(values=Learned(layout) if known else None)
-
-
-def learned_method(run: Run) -> Method:
-    """By the beam of an agent of outlines, as wide as that looks ahead, without a search."""
-    from tangram_agent.agents.outline.filler import Fillable  # noqa: PLC0415  # needs torch
-
-    values, agent = Fillable(_network(run), run.task.layout), cast("Outline", run.setup.agent)
-    return Method(search=False, width=agent.config.beam, values=values)
 
 
 def _network(run: Run) -> "nn.Module":

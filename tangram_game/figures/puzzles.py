@@ -16,7 +16,7 @@ from tangram_core.errors import ConfigError
 from tangram_core.seeding import episode_generator
 from tangram_core.spec import Arrays
 from tangram_core.task import Chooser, Env, Generators
-from tangram_sim.config import SILHOUETTES, RewardConfig
+from tangram_sim.config import SILHOUETTE, RewardConfig
 from tangram_sim.puzzles.assembly import Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import SPLITS, library, read_puzzles
 from tangram_sim.targets.targets import placement, turned_figure
@@ -86,7 +86,6 @@ def play_figures(
     player: Player,
     seed: int,
     touching: bool = True,
-    known: bool = False,
     at_once: int = AT_ONCE,
 ) -> Played:
     """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
@@ -97,7 +96,6 @@ def play_figures(
         player: moves them.
         seed: of the starts.
         touching: whether their pieces touch, so that no picture tells them apart.
-        known: whether they were seen before, in pictures that told their pieces.
         at_once: most that are played at a time.
 
     Raises:
@@ -105,12 +103,12 @@ def play_figures(
         SamplingError: the tokens find no room to start.
     """
     looks = task.sim.observe == "pictures"
-    if looks and touching and not known:
+    if looks and touching:
         raise ConfigError(
             "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
-            "sim.observe=corners, or silhouette_pictures in tangram-eval"
+            "sim.observe=corners"
         )
-    shows = looks or task.sim.observe in SILHOUETTES
+    shows = looks or task.sim.observe == SILHOUETTE
     sim = task.sim if shows else task.sim.blind
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     shown = replace(task, sim=sim, reward=RewardConfig())
@@ -120,7 +118,7 @@ def play_figures(
             return _generator(figures[number], seed)
 
         def begin(numbers: Ints, generators: Generators) -> Arrays:
-            return env.reset(generators, (targets[0][numbers], targets[1][numbers]), known)
+            return env.reset(generators, (targets[0][numbers], targets[1][numbers]))
 
         choose, count = player(env), len(figures)
         return Played.of(

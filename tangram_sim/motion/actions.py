@@ -6,7 +6,7 @@ Legend: B actions of A entries each, K tokens.
 import numpy as np
 
 from tangram_core.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.config import SILHOUETTES, SimConfig
+from tangram_sim.config import SILHOUETTE, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.kinematics import wrap
 
@@ -49,7 +49,7 @@ def goal_rows(layout: Layout, sim: SimConfig) -> int:
 
     An outline has no more corners than its pieces, and each ring one row more, see `rings`.
     """
-    if sim.observe not in SILHOUETTES:
+    if sim.observe != SILHOUETTE:
         return layout.corner_count
     return layout.corner_count + layout.tokens
 

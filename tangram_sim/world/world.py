@@ -87,12 +87,6 @@ def check_shown(sim: SimConfig, outlines: bool) -> None:
             "agent=outline; tangram-eval puzzle= fills what it shows to others by a search, and "
             "tangram-play silhouette= too; set sim.observe=corners"
         )
-    if sim.observe == "silhouette_pictures":
-        raise ConfigError(
-            "sim.observe=silhouette_pictures is for tangram-eval puzzle=, which fills what a "
-            "picture shows before a token is moved; no agent trains so: set sim.observe=silhouette "
-            "with agent=outline, else sim.observe=corners"
-        )
 
 
 def make_world(layout: Layout, sim: SimConfig) -> World:

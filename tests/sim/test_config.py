@@ -72,7 +72,6 @@ REFUSED = [
         {"observe": "pictures", "picture": "grey"},
         "^sim.observe=pictures needs .*: set sim.pixels=128$",
     ),
-    (SimConfig, {"observe": "silhouette_pictures"}, "^sim.observe=silhouette_pictures needs pict"),
     (SimConfig, {"pixels": 64, "picture": "x"}, "^sim.picture must be one of binary, grey, got"),
     (SimConfig, {"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
     (SimConfig, {"motion": "slide", "backend": "kinematic"}, "needs .* got sim.backend=kinematic"),

@@ -14,12 +14,11 @@ from PIL import Image
 
 import tangram_tasks.register  # noqa: F401  # registers the environments
 from tangram_core.errors import ConfigError
-from tangram_core.task import Chooser, Env
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.hidden import Hidden, hide, lay, play_hidden
 from tangram_game.figures.puzzles import Figure, find_figures, play_figures
-from tangram_game.scores import RUN, hidden_lines, hidden_means, score_hidden
+from tangram_game.scores import hidden_lines, hidden_means, score_hidden
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.areas import overlap
@@ -37,14 +36,12 @@ pytestmark = pytest.mark.fast
 
 PLAIN = {"backend": "kinematic", "starts": "outside"}
 OUTLINE = PLAIN | {"observe": "silhouette"}
-PICTURE = PLAIN | {"observe": "silhouette_pictures", "pixels": 128, "picture": "grey"}
 
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine must find what an idle one finds."""
     monkeypatch.setattr("tangram_game.figures.hidden.SECONDS", 60.0)
-    monkeypatch.setattr("tangram_vision.silhouettes.silhouette_pictures._EACH_S", 60.0)
 
 
 def game(sim: dict[str, Any]) -> Place:
@@ -68,15 +65,14 @@ def exact(hidden: Hidden) -> Any:
 # What reaches the player
 
 
-@pytest.mark.parametrize("sim", [OUTLINE, PICTURE], ids=["outline", "picture"])
-def test_hidden_pieces_do_not_reach_the_player(sim: dict[str, Any]) -> None:
+def test_hidden_pieces_do_not_reach_the_player() -> None:
     """Other pieces with the same outline: the same actions from the same starts."""
     one, other = square(), square(mirrored=True)
     assert (one.flipped != other.flipped).any()
     assert np.abs(one.poses - other.poses).max() > 0.1
     played = []
     for figure in (one, other):
-        hidden = hide(game(sim), [figure])
+        hidden = hide(game(OUTLINE), [figure])
         assert hidden.filled == 1
         played.append(lay(hidden, exact(hidden), seed=0))
     for name in ("corners", "goals", "actions"):
@@ -85,11 +81,9 @@ def test_hidden_pieces_do_not_reach_the_player(sim: dict[str, Any]) -> None:
     np.testing.assert_array_equal(played[0].starts, played[1].starts)
 
 
-@pytest.mark.parametrize("sim", [OUTLINE, PICTURE], ids=["outline", "picture"])
-def test_what_was_found_reaches_the_player(sim: dict[str, Any]) -> None:
-    made = game(sim)
-    names = ["hut", "two_squares"] if sim is OUTLINE else ["heart"]  # seeing takes its time
-    hidden = hide(made, find_figures("test", made, names))
+def test_what_was_found_reaches_the_player() -> None:
+    made = game(OUTLINE)
+    hidden = hide(made, find_figures("test", made, ["hut", "two_squares"]))
     played = lay(hidden, exact(hidden), seed=0)
     laid = [made.layout.corners(one.laid.poses, one.laid.flipped) for one in hidden.searches]
     np.testing.assert_allclose(played.episodes["goals"], laid, atol=1e-6)
@@ -204,12 +198,6 @@ def test_the_search_is_part_of_a_puzzles_time() -> None:
     assert seconds > 1000.0
 
 
-def test_a_picture_that_shows_nothing_is_not_filled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tangram_vision.pictures.levels.MIN_CONTRAST", 300)
-    hidden = hide(game(PICTURE), [square()])
-    assert hidden.searches[0].laid is None
-
-
 # What is told
 
 
@@ -259,31 +247,16 @@ def test_the_report_has_a_row_for_each_puzzle(
         assert picture.format == "PNG"
 
 
-def test_pictures_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-
-    def formula(_: Env) -> Chooser:
-        return exact_policy(game(PICTURE).layout, game(PICTURE).sim)
-
-    monkeypatch.setattr("tangram_game.evaluate.policies", lambda *_: {RUN: formula})
-    report = evaluated(tmp_path, PICTURE, "square")
-    assert report["iou"] > 0.95
-    assert "grey pictures of 128 px, pieces hidden" in " ".join(capsys.readouterr().out.split())
-
-
 # What is refused
 
 
 def test_elsewhere_silhouettes_are_refused() -> None:
     reason = "^sim.observe=silhouette is for an agent of outlines: .*corners$"
-    other = "^sim.observe=silhouette_pictures is for tangram-eval puzzle=, .*corners$"
-    for sim, told in (OUTLINE, reason), (PICTURE, other):
-        made = game(sim)
-        with pytest.raises(ConfigError, match=told):
-            BatchedEnv(made.layout, made.sim, RewardConfig())
-        with pytest.raises(ConfigError, match=told):
-            play_figures(made, [square()], lambda _: None, 0)
+    made = game(OUTLINE)
+    with pytest.raises(ConfigError, match=reason):
+        BatchedEnv(made.layout, made.sim, RewardConfig())
+    with pytest.raises(ConfigError, match=reason):
+        play_figures(made, [square()], lambda _: None, 0)
     with pytest.raises(ConfigError, match=reason):
         gymnasium.make("Tangram-v0", observe="silhouette")
 

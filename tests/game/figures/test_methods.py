@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from tangram_agent.runs import load_run
 from tangram_core.task import Chooser, Env
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
-from tangram_game.figures.methods import Learned, learned_method, together
+from tangram_game.figures.methods import Learned, together
 from tangram_game.figures.puzzles import find_figures
 from tangram_game.figures.silhouettes import read_silhouette
 from tangram_game.scores import RUN, score_hidden
@@ -78,22 +77,6 @@ def test_it_is_told_who_filled_what(
 
 
 FILLER = "pretrained/tangram7_silhouette"
-SHOWN = {"sim": {"backend": "kinematic", "observe": "silhouette_pictures", "pixels": 64}}
-
-
-@pytest.mark.fast
-def test_an_agent_of_outlines_fills_pictures_itself(tmp_path: Path) -> None:
-    """By its own beam; what it finds is laid by the formula, as what others find is."""
-    out, grey = tmp_path / "scores.json", {"sim": SHOWN["sim"] | {"picture": "grey"}}
-    config = EvalConfig(FILLER, puzzle=("heart", "swan"), out=str(out), changes=grey)
-    assert evaluate_run(config) == 0
-    report = json.loads(out.read_text())
-    assert report["filled_by"] == {"search": 0, "beam": 2}
-    assert report["share_solved_iou"] == 1.0
-    largest, search = (report["baselines"][name] for name in ("largest first", "search"))
-    assert largest["filled_by"]["search"] == 0
-    assert largest["search_seconds"] != report["search_seconds"]
-    assert search["filled_by"] == {"search": 2, "beam": 0}
 
 
 @pytest.mark.fast
@@ -113,11 +96,3 @@ def test_a_report_takes_the_scores_of_an_agent_of_outlines(
         assert scores["mean_reward"] == pytest.approx(
             2.0 * np.mean(scores["coverage_each"]) - 1.0, abs=1e-5
         )
-
-
-@pytest.mark.fast
-@pytest.mark.parametrize(("settings", "width"), [({}, 12), ({"beam": 1}, 1)])
-def test_a_run_fills_by_as_wide_a_beam_as_it_looks_ahead(settings: Any, width: int) -> None:
-    run = load_run(FILLER)
-    method = learned_method(run.with_settings({"agent": settings}) if settings else run)
-    assert told(method) == (False, width, True)

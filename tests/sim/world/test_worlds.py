@@ -277,13 +277,3 @@ def test_silhouettes_are_shown_to_who_knows_outlines() -> None:
     with pytest.raises(ConfigError, match=reason):
         BatchedEnv(layout_of("square"), shown, RewardConfig(), 1)
     check_shown(shown, outlines=True)
-
-
-@pytest.mark.parametrize("outlines", [False, True])
-def test_pictures_of_silhouettes_are_for_evaluations_alone(outlines: bool) -> None:
-    shown = SimConfig(backend="kinematic", observe="silhouette_pictures", pixels=64)
-    reason = "^sim.observe=silhouette_pictures is for tangram-eval puzzle=, .*corners$"
-    with pytest.raises(ConfigError, match=reason):
-        check_shown(shown, outlines)
-    with pytest.raises(ConfigError, match=reason):
-        BatchedEnv(layout_of("square"), shown, RewardConfig(), 1, outlines=outlines)
