@@ -101,7 +101,7 @@ WRONG = [
     ),
     ("tangram-train tokens=pentagon", "unknown tokens 'pentagon': choose from hexagon, large_tri"),
     ("tangram-train tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
-    ("tangram-train seed=abc", 'field "seed" - should be "int"'),
+    ("tangram-train seed=abc", "seed must be a whole number, got abc"),
     ("tangram-train run_dir=", "run_dir must name a folder"),
     (
         "tangram-experiment run_dir=/dev/null",
