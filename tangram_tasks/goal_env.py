@@ -64,10 +64,8 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
 
         def box(*names: str) -> spaces.Box:
             fields = [spec.field(name) for name in names]
-            low, high = (
-                np.concatenate([np.full(int(np.prod(one.shape)), bound) for one, bound in pairs])
-                for pairs in ([(f, f.low) for f in fields], [(f, f.high) for f in fields])
-            )
+            sizes = [math.prod(one.shape) for one in fields]
+            low, high = np.repeat([(one.low, one.high) for one in fields], sizes, axis=0).T
             return spaces.Box(low, high, dtype=np.float64)
 
         self.observation_space = spaces.Dict(
