@@ -104,7 +104,7 @@ class Env(ABC):
 
     def told(self) -> Json:
         """What gymnasium's `info` has of the last step of the first environment."""
-        return {name: rows[0] for name, rows in self.facts().items()}
+        return {}
 
     def picture(self, size: int) -> Pixels | None:  # noqa: ARG002
         """The first environment as it is now, (size, size, 3); None: there is none."""

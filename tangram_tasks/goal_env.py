@@ -4,7 +4,6 @@ Legend: A entries of an action, n goals.
 """
 
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -54,7 +53,9 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         """
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode must be None or rgb_array, got '{render_mode}'")
-        check_range("render_size", operator.index(render_size), 1, MAX_SIDE)
+        if not isinstance(render_size, int | np.integer):
+            raise ConfigError(f"render_size must be a whole number, got {render_size}")
+        check_range("render_size", render_size, 1, MAX_SIDE)
         task.check(plays=True)
         self.task, self.render_mode, self._size = task, render_mode, render_size
         self._env, spec = task.make(1), task.spec

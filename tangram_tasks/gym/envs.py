@@ -8,7 +8,7 @@ import numpy as np
 from tangram_core.arrays import Bools, Singles
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.spec import Array, Arrays
-from tangram_core.task import Env, Generators, Step
+from tangram_core.task import Env, Generators, Json, Step
 from tangram_tasks.gym.judge import (
     ACHIEVED,
     DESIRED,
@@ -74,6 +74,10 @@ class GymEnv(Env):
     def facts(self) -> Arrays:
         """Whether each is a success now, as the environment says."""
         return {SUCCESS: self._success.copy()}
+
+    def told(self) -> Json:
+        """Whether the first is a success, as it says: it may never terminate."""
+        return {"is_success": bool(self._success[0])}
 
     def close(self) -> None:
         """Close all."""

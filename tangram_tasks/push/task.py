@@ -157,7 +157,7 @@ class Push(Task):
             )
         return tuple(figures_of(self.layout, self.tokens.scale, named))
 
-    @property
+    @cached_property
     def spec(self) -> EpisodeSpec:
         """Corners of all tokens, and where they should come; AWAY where one is not there."""
         shape = (self.layout.corner_count, 2)

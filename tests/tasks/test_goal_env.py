@@ -216,7 +216,12 @@ def test_compute_reward_is_the_reward_of_the_step(reward: str) -> None:
 def test_goals_of_other_shapes_are_refused_and_copies_too() -> None:
     env = kinematic()
     own = env.reset(seed=0)[0]["achieved_goal"]
-    for achieved, desired in ((np.tile(own, 2), own), (own[None], own), ([own] * 2, [own] * 3)):
+    for achieved, desired in (
+        (np.tile(own, 2), own),
+        (own[None], own),
+        ([own] * 2, [own] * 3),
+        (own[None, None], own[None, None]),
+    ):
         with pytest.raises(ValueError, match="a goal must have shape"):
             env.compute_reward(achieved, desired, {})
     with pytest.raises(TypeError, match="holds an engine and cannot be copied"):
@@ -245,6 +250,7 @@ def test_render() -> None:
         ({"render_mode": "3d"}, "render_mode must be None or rgb_array, got '3d'"),
         ({"gravity": 9.81}, "there is no setting sim.gravity: delete it"),
         ({"render_size": 0}, "render_size must be between 1 and 4096, got 0"),
+        ({"render_size": 10.5}, "render_size must be a whole number, got 10.5"),
         ({"scale": "big"}, "tokens.scale must be a number, got big"),
         ({"arena": -1.0}, "sim.arena must be"),
         ({"allow_flip": True}, "sim.allow_flip=true needs a token that is not its own mirror"),

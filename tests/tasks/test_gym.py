@@ -1,6 +1,7 @@
 """Environments of gymnasium as a task: what is played, what it is worth, and what is refused."""
 
 import sys
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from tangram_core.errors import ConfigError, RunError
 from tangram_core.seeding import episode_generator
 from tangram_core.spec import Episodes
 from tangram_core.task import Played
+from tangram_tasks.goal_env import TaskEnv
 from tangram_tasks.gym.task import Gym, GymConfig
 
 pytestmark = pytest.mark.fast
@@ -139,3 +141,18 @@ def test_lockstep_is_refused_where_an_episode_hangs_on_the_one_before() -> None:
     Gym(replace(TOY, id="Wears-v0", fresh=True)).check_exact()
     with pytest.raises(ConfigError, match="set task.fresh=true"):
         Gym(replace(TOY, id="Wears-v0")).check_exact()
+
+
+def test_it_is_an_environment_of_gymnasium_again_and_tells_success_though_nothing_ends() -> None:
+    found = list[bool]()
+    with closing(TaskEnv(Gym(replace(TOY, ends=False)))) as env:
+        env.action_space.seed(0)
+        for seed in range(20):
+            env.reset(seed=seed)
+            seen, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            goals = seen["achieved_goal"], seen["desired_goal"]
+            assert env.compute_reward(*goals, info) == reward
+            assert info["is_success"] is (reward == 0.0)
+            assert (terminated, truncated, env.render()) == (False, False, None)
+            found.append(info["is_success"])
+    assert len(set(found)) == 2
