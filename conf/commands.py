@@ -18,16 +18,17 @@ Plain = dict[str, Any]
 USUAL = Kinds()
 NEEDED = "???"  # hydra's word for a value that must be given
 
-# In this order presets are merged. A task brings its world; an agent brings its own net, net=... on
-# the command line wins; a set of several tokens comes last, as it brings its starts.
-GROUPS = ("task", "sim", "reward", "net", "agent", "service", "tokens")
+# In this order presets are merged. A task brings its world; an agent brings its own net and pace,
+# net=... and service=... on the command line win; a set of several tokens comes last, as it brings
+# its starts.
+GROUPS = ("task", "sim", "reward", "net", "service", "agent", "tokens")
 RUN: dict[str, str | list[str]] = {
     "sim": "physics",
     "reward": "overlap",
     "task": "place",
     "net": "mha_narrow",
-    "agent": "tangram",
     "service": "local",
+    "agent": "tangram",
     "tokens": "square",
 }
 OVER = ("task", "sim", "reward", "agent")
@@ -287,7 +288,7 @@ rows to STUDY.csv; what has its rows is skipped, and what was cut goes on from i
 the same command can be given again and again. tangram-report draws what is there.""",
         (
             "tangram-experiment budget=smoke",
-            "tangram-experiment study=paper_size budget=paper jobs=4",
+            "tangram-experiment study=paper budget=paper jobs=4",
             "tangram-experiment study=game seeds=3 jobs=8",
         ),
         ("tangram_lab.experiments.studies:StudyConfig",),

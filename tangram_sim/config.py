@@ -17,7 +17,7 @@ PICTURES = ("binary", "grey")
 SILHOUETTE = "silhouette"  # what the target looks like without its pieces
 OBSERVED = ("corners", "pictures", SILHOUETTE)
 # The settings of the camera.
-CAMERA = ("pixels", "picture")
+CAMERA = ("pixels", "view", "picture")
 MOTIONS = ("lift", "slide")
 # Share of a token that may come to lie on others where it is set down: the engine pushes such
 # tokens apart by a little, and with more it would move what is placed.
@@ -56,6 +56,10 @@ class SimConfig(Settings, section="sim"):
         "split; touching: connected or figures by chance",
         choices=TARGETS,
     )
+    overhang: bool = setting(
+        False,
+        "the middles of tokens lie anywhere in the arena, so that they may hang over its edge",
+    )
     starts: str = setting(
         "anywhere",
         "in the arena, or outside of the target where there is room",
@@ -76,6 +80,13 @@ class SimConfig(Settings, section="sim"):
         "evaluators, which report Eq. 14 by them",
         low=0,
         high=1024,
+    )
+    view: float = setting(
+        1.0,
+        "width of what pictures show, in arenas",
+        low=1,
+        high=100,
+        unless={"pixels": 0},
     )
     picture: str = setting(
         "binary",
@@ -120,6 +131,11 @@ class SimConfig(Settings, section="sim"):
         if not self.pixels:
             raise ConfigError(
                 f"sim.observe={self.observe} needs pictures, got sim.pixels=0: set sim.pixels=128"
+            )
+        if self.view != 1.0:
+            raise ConfigError(
+                f"sim.observe={self.observe} needs pictures of the arena, got sim.view="
+                f"{self.view:g}: set sim.view=1"
             )
 
 

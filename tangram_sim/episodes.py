@@ -36,5 +36,5 @@ def spec_of(
         ),
         achieved="corners",
         desired="goals",
-        rewards=reward_bounds(reward, sim, bound),
+        rewards=reward_bounds(reward),
     )

@@ -20,7 +20,10 @@ from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.sight.pictures import token_pixels
 
 MAX_REWARD = 1e6  # of a user's own function
-SHARPNESS = 100.0  # s: how steep the logarithm is near the target
+LEAST_SHOWN = 16  # pixels that a token covers at least where Eq. 14 is measured on pictures
+SHARPNESS = (
+    200.0 * 2.0**0.5
+)  # s: how steep the logarithm is near the target; the authors' 2.83 / .01
 RewardFn = Callable[[Floats, Floats], Floats]
 UserReward = Callable[[Floats, Floats, Layout], Any]
 
@@ -28,23 +31,39 @@ UserReward = Callable[[Floats, Floats, Layout], Any]
 def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardFn:
     """The configured reward as a function (achieved, desired) -> (B,).
 
-    With source=camera it is Eq. 14 on polygons too: a goal that was relabelled has no picture.
-    `BatchedEnv` replaces it by the camera's value while playing.
+    With source=camera it is Eq. 14 on polygons too, and -1 for a goal that no picture shows: one
+    that was relabelled has none. `BatchedEnv` replaces it by the camera's value while playing.
 
     Raises:
-        ConfigError: the camera is to be the source but is off, or a user's function that cannot
-            be loaded; later, when called, one whose output has the wrong shape or is not finite.
+        ConfigError: the camera is to be the source but is off or too coarse, or a user's function
+            that cannot be loaded; later, when called, one whose output has the wrong shape or is
+            not finite.
     """
-    if config.source == "camera" and not sim.pixels:
-        raise ConfigError("reward.source=camera needs pictures: set sim.pixels=64")
+    if config.source == "camera":
+        _check_camera(layout, sim)
     # The longest distance of two points of the arena.
     reach = sim.arena * np.sqrt(2.0)
     if config.own is not None:
         function = _load(config, *config.own)
         return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
+    if config.source == "camera":
+        return lambda achieved, desired: _shown(achieved, desired, layout, sim.arena * sim.view)
     if config.name == "overlap":
         return lambda achieved, desired: overlap(achieved, desired, layout)
     return lambda achieved, desired: dense(achieved, desired, layout, reach)
+
+
+def _check_camera(layout: Layout, sim: SimConfig) -> None:
+    if not sim.pixels:
+        raise ConfigError("reward.source=camera needs pictures: set sim.pixels=64")
+    side, least = sim.arena * sim.view / np.sqrt(layout.areas), np.sqrt(LEAST_SHOWN)
+    pixels, worst = int(np.ceil(side.max() * least)), layout.shapes[int(np.argmax(side))]
+    if sim.pixels < pixels:
+        shown = (sim.pixels / side.max()) ** 2
+        raise ConfigError(
+            f"reward.source=camera measures tokens in pixels, and {worst.name} covers {shown:.3g} "
+            f"of at least {LEAST_SHOWN}: raise sim.pixels from {sim.pixels} to {pixels}"
+        )
 
 
 def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
@@ -62,6 +81,12 @@ def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
 def overlap(achieved: Floats, desired: Floats, layout: Layout) -> Floats:
     """Eq. 14 on exact polygons, from [0, 1] to [-1, 1]: r = 2 * covered share of the target - 1."""
     return scaled_overlap(overlap_share(achieved, desired, layout))
+
+
+def _shown(achieved: Floats, desired: Floats, layout: Layout, width: float) -> Floats:
+    """Eq. 14, and -1 where pictures of such a width show no corner of the goal."""
+    shown = np.abs(desired).max(axis=2).min(axis=1) < width / 2.0
+    return np.where(shown, overlap(achieved, desired, layout), -1.0)
 
 
 def scaled_overlap(share: Floats) -> Floats:
@@ -107,30 +132,19 @@ def dense(achieved: Floats, desired: Floats, layout: Layout, reach: float) -> Fl
 
 
 def closeness(distance: Floats, reach: float) -> Floats:
-    """+1 at distance 0, -1 at `reach`: r = 1 - 2 log(1 + s d / reach) / log(1 + s).
+    """+1 at distance 0, -1 from `reach` on: r = 1 - 2 log(1 + s d / reach) / log(1 + s).
 
-    The slope at the target is s / log(1 + s) times that of a straight line, and the reward is 0
-    at about reach / sqrt(s). With s = 100 half of the scale is spent on the nearest
-    tenth of the arena's diagonal, about the size of a token, and the slope at the target is 22
-    times the straight line's. Beyond `reach`, outside the arena, the logarithm goes on below -1,
-    so that a token that left still has a way back.
+    As in the authors' code: the slope at the target is 50 times that of a straight line.
     """
     scaled: Floats = 1.0 - 2.0 * np.log1p(SHARPNESS * distance / reach) / np.log1p(SHARPNESS)
-    return scaled
+    return np.maximum(scaled, -1.0)
 
 
-def reward_bounds(config: RewardConfig, sim: SimConfig, bound: float) -> tuple[float, float]:
-    """The least and the largest reward where no coordinate is beyond +-bound.
-
-    Of a user's own function nothing is known: it may return up to MAX_REWARD.
-    """
+def reward_bounds(config: RewardConfig) -> tuple[float, float]:
+    """The least and the largest reward; a user's own function may return up to MAX_REWARD."""
     if config.own is not None:
         return -MAX_REWARD, MAX_REWARD
-    if config.name == "overlap":
-        return -1.0, 1.0
-    farthest = np.array(2.0 * np.sqrt(2.0) * bound)
-    least = closeness(farthest, sim.arena * np.sqrt(2.0))
-    return min(-1.0, float(least)), 1.0
+    return -1.0, 1.0
 
 
 def reward_identity(config: RewardConfig) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of
 from conf.settings import PAGE, page
 from tangram_agent.agents.pair.agent import PairConfig
-from tangram_agent.base.config import NetConfig
+from tangram_agent.base.config import RelabelConfig
 from tangram_core.errors import ConfigError, TangramError
 from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import KEY, PLAY, declared_fields
@@ -58,7 +58,6 @@ def test_what_is_not_given_is_as_the_tangram_agent_has_it() -> None:
     assert setup.agent.config == PairConfig()
     assert (setup.task.sim, setup.task.reward) == (SimConfig(), RewardConfig())
     assert from_mapping(ServiceConfig, compose("train")["service"]) == ServiceConfig()
-    assert make_setup(compose("train", "agent=paper")).agent.net == NetConfig()
 
 
 @pytest.mark.parametrize("primary", WITH_GROUPS)
@@ -112,21 +111,28 @@ def test_net_is_the_agents_unless_it_is_chosen(
     assert compose(primary, *overrides)["net"] == COMMANDS["train"].sections()["net"] | expected
 
 
-@pytest.mark.parametrize("name", ["paper", "mlp"])
-def test_where_the_paper_is_silent_its_presets_follow_the_hindsight_paper(name: str) -> None:
-    """Values of the appendix of [16]."""
-    agent = make_setup(compose("train", f"agent={name}")).agent.config
-    assert agent.saturation_penalty == 1.0
-    assert (agent.noise, agent.uniform_share) == (0.1, 0.2)
-    assert (agent.gamma, agent.polyak, agent.batch_size) == (0.98, 0.95, 128)
-    assert agent.actor_lr == agent.critic_lr == 1e-3
+def test_pace_is_the_agents_unless_it_is_chosen() -> None:
+    usual = compose("train", "agent=mlp", "service=local")["service"]
+    assert from_mapping(ServiceConfig, usual) == ServiceConfig()
 
 
 @pytest.mark.parametrize("name", ["paper", "mlp"])
-def test_paper_presets_add_nothing_to_the_text(name: str) -> None:
-    agent = make_setup(compose("train", f"agent={name}")).agent.config
-    assert (agent.lr_final, agent.acting_average) == (1.0, 0.0)
-    assert [relabel.strategy for relabel in agent.hindsight] == ["final"]
+def test_the_papers_presets_are_what_its_authors_ran(name: str) -> None:
+    settings = compose("train", f"agent={name}", "sim=paper")
+    setup, service = make_setup(settings), from_mapping(ServiceConfig, settings["service"])
+    agent, sim, jobs = setup.agent.config, setup.task.sim, 16  # simulations of a worker's job
+    assert (service.mode, service.batch_episodes(1)) == ("lockstep", jobs)
+    assert agent.updates_per_transition * jobs == agent.actor_delay == 51
+    assert (agent.learning_starts, agent.batch_size, agent.replay_capacity) == (jobs, 64, 12_500)
+    assert (agent.actor_lr, agent.critic_lr, agent.lr_final) == (5e-4, 1e-3, 1.0)
+    assert (agent.noise, agent.noise_inside, agent.uniform_share) == (0.1, True, 0.0)
+    assert (agent.gamma, agent.polyak, agent.saturation_penalty) == (0.99, 0.999, 0.0)
+    assert (agent.acting_average, agent.flags) == (0.0, False)
+    assert agent.hindsight == (RelabelConfig("final"),)
+    assert (sim.arena * sim.view, sim.pixels, sim.overhang) == (5.0, 200, True)
+    twice = name == "mlp"
+    assert (agent.actor_tanh, agent.critic_tanh) == (1 + twice, twice)
+    assert (setup.agent.net.rectified, setup.agent.net.init == "authors") == (not twice,) * 2
 
 
 # A run's config in place of the groups

@@ -10,6 +10,7 @@ from torch import nn
 
 from tangram_agent.agents.scene.agent import Scene
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
+from tangram_agent.agents.scene.scenes import SceneGraph
 from tangram_agent.nets.networks import perceptron
 
 
@@ -37,4 +38,5 @@ class Sets(Scene):
     """The paper's agent but for its layers."""
 
     def networks(self, layout):
-        return ActorNet(layout, self.net, SetsHead), CriticNet(layout, self.net, SetsHead)
+        graph = SceneGraph(layout)
+        return ActorNet(graph, self.net, SetsHead), CriticNet(graph, self.net, SetsHead)

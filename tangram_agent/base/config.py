@@ -25,19 +25,28 @@ class NetConfig(Settings, section="net"):
         high=65536,
         only={"kind": "mlp"},
     )
+    activation: str = setting(
+        "relu", "between the layers", choices=("relu", "tanh"), only={"kind": "mlp"}
+    )
     width: int = setting(64, "size of a node's embedding", low=1, high=4096, only={"kind": "mha"})
     layers: int = setting(3, "rounds of message passing", low=1, high=64, only={"kind": "mha"})
     feed_forward: int = setting(
         512,
-        "hidden width of g in Eq. 13; 0: the single layer of Eq. 8",
-        low=0,
+        "hidden width of g in Eq. 13",
+        low=1,
         high=65536,
         only={"kind": "mha"},
     )
-    scale: str = setting(
-        "d",
-        "Eq. 10 divides the scores by d (the paper) or by sqrt_d (learn2assemble)",
-        choices=("d", "sqrt_d"),
+    rectified: bool = setting(
+        False,
+        "ReLU after the embedding (Eq. 8) and before the last layer",
+        only={"kind": "mha"},
+    )
+    init: str = setting(
+        "fan_in",
+        "weights are drawn within the root of 1 / inputs; authors: queries, keys and values within "
+        "that of 1 / width of a head, the embedding by Glorot and Bengio (2010) for ReLU",
+        choices=("fan_in", "authors"),
         only={"kind": "mha"},
     )
 

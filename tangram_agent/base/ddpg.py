@@ -5,7 +5,7 @@ Legend: M views.
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ class Steps:
             None where nothing follows on any of them.
         seen_after: that too where an afterstate critic is to see it as it was, else it sees the
             exact motion.
+        acts: whether the actor moves.
     """
 
     view: Any
@@ -46,6 +47,7 @@ class Steps:
     start: Any
     follow: Any
     seen_after: Any = None
+    acts: bool = True
 
 
 class Ddpg(TokenLearner):
@@ -121,6 +123,8 @@ class Ddpg(TokenLearner):
             y = self._target(seen)
         q = self.critic(seen.view, seen.velocity, seen.seen_after, features)
         yield Loss("critic", (q - y).square().mean(), {"q": q.mean()})
+        if not seen.acts:
+            return
         velocity, raw = self.actor(seen.start, features)
         value = -self.critic(seen.start, velocity, None, features).mean()
         # Keeps tanh or clamp from going flat.
@@ -148,7 +152,9 @@ class Ddpg(TokenLearner):
         size = self.config.batch_size
         columns = {name: array[:size] for name, array in self.replay.arrays.items()}
         columns["done"] = np.full(size, not self.bootstraps, np.uint8)
-        yield self.steps(Transitions(**columns), np.random.default_rng(0))
+        seen = self.steps(Transitions(**columns), np.random.default_rng(0))
+        for acts in (True, False)[: self.delay]:
+            yield replace(seen, acts=acts)
 
     def if_any_follows(self, done: npt.NDArray[Any], follow: Any) -> Any:
         """What follows, where a target network is to be asked of it; else None."""

@@ -114,8 +114,6 @@ class ActorCritic(NetworkLearner, Generic[Config]):
 
     def bounded(self, values: Tensor) -> Tensor:
         """Values (B,) within what the task's rewards can add up to: r / (1 - gamma)."""
-        if not self.config.clip_targets:
-            return values
         least, most = self._task.spec.rewards
         whole = 1.0 - self.config.gamma
         return values.clamp(min(least, 0.0) / whole, max(most, 0.0) / whole)

@@ -61,17 +61,6 @@ class BaseConfig(EpisodeConfig, section="agent"):
     hidden: tuple[int, ...] = setting(
         (256, 256), "widths of the hidden layers", low=1, high=65536, part=NETWORK
     )
-    layer_norm: bool = setting(True, "normalise each hidden layer (Ba et al. 2016)", part=NETWORK)
-    clip_targets: bool = setting(
-        True, "keep targets within what the task's rewards can add up to", part=LEARNING
-    )
-    moved_share: float = setting(
-        0.5,
-        "share of a batch from episodes whose goal was not achieved at their start already",
-        low=0,
-        high=1,
-        part=LEARNING,
-    )
     noise: float = setting(
         0.2, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
     )

@@ -19,7 +19,7 @@ class Policy(nn.Module):
 
     def __init__(self, inputs: int, actions: int, config: BaseConfig) -> None:
         super().__init__()
-        self.layers = perceptron(inputs, config.hidden, actions, config.layer_norm)
+        self.layers = perceptron(inputs, config.hidden, actions, norm=True)
         self.actions, self._noise = actions, config.noise
 
     def forward(self, rows: Tensor) -> Tensor:
@@ -38,7 +38,7 @@ class Critics(nn.Module):
     def __init__(self, inputs: int, actions: int, config: BaseConfig, count: int = 2) -> None:
         super().__init__()
         self.each = nn.ModuleList(
-            perceptron(inputs + actions, config.hidden, 1, config.layer_norm) for _ in range(count)
+            perceptron(inputs + actions, config.hidden, 1, norm=True) for _ in range(count)
         )
 
     def forward(self, rows: Tensor, actions: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from tangram_core.spec import ACTIONS, Array, Episodes
 from tangram_core.task import Task
 
 CPU = torch.device("cpu")
+MOVED_SHARE = 0.5  # of a batch, from episodes whose goal was not achieved at their start already
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ class EpisodeReplay(Ring):
         """
         rows, moved = self.drawn(config.batch_size, rng), np.flatnonzero(self._moved)
         if len(moved):
-            own = rng.random(config.batch_size) < config.moved_share
+            own = rng.random(config.batch_size) < MOVED_SHARE
             rows[own] = moved[rng.integers(len(moved), size=own.sum())]
         return rows
 

@@ -16,6 +16,14 @@ NO_EDGE = -1e30
 SHORT_ROW = 16
 
 
+class Drawn(nn.Linear):
+    """A layer without bias whose weights are drawn within a bound of its own, if any."""
+
+    def __init__(self, inputs: int, outputs: int, bound: float | None) -> None:
+        super().__init__(inputs, outputs, bias=False)
+        self.bound = bound
+
+
 class GraphAttention(nn.Module):
     """One MHA layer: Eqs. 9-12.
 
@@ -23,12 +31,12 @@ class GraphAttention(nn.Module):
     side by side is another.
     """
 
-    def __init__(self, width: int, heads: int, scale: str) -> None:
+    def __init__(self, width: int, heads: int, init: str) -> None:
         super().__init__()
         self.heads, self.key_width = heads, width // heads
-        # Eq. 10 divides by d; learn2assemble, which the paper follows, by the root of it.
-        self.scale = 1.0 / (self.key_width if scale == "d" else math.sqrt(self.key_width))
-        self.query_key_value = nn.Linear(width, 3 * width, bias=False)
+        # Eq. 10 divides by d, which the authors' code has as the root of the key width.
+        self.scale = 1.0 / math.sqrt(self.key_width)
+        self.query_key_value = Drawn(width, 3 * width, self.scale if init == "authors" else None)
         self.combine = nn.Linear(width, width, bias=False)
 
     def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
@@ -62,22 +70,18 @@ def softmax_mean(scores: Tensor, value: Tensor) -> Tensor:
 class EncoderLayer(nn.Module):
     """One round of message passing, Eq. 13: attention and g, each with a skip connection.
 
-    With `feed_forward` > 0, g is width-feed_forward-width with one ReLU between, as in the code
-    base that the paper follows: only so do the counts give the paper's 504k. With 0 it is the
-    literal g of Eq. 8, a single layer with ReLU.
+    g is width-feed_forward-width with one ReLU between, as in the authors' code: a single layer, as
+    Eq. 8 has it, would not give the paper's 504k.
     """
 
     def __init__(self, config: NetConfig) -> None:
         super().__init__()
-        self.attention = GraphAttention(config.width, HEADS, config.scale)
-        if config.feed_forward:
-            self.transform = nn.Sequential(
-                nn.Linear(config.width, config.feed_forward),
-                nn.ReLU(),
-                nn.Linear(config.feed_forward, config.width),
-            )
-        else:
-            self.transform = nn.Sequential(nn.Linear(config.width, config.width), nn.ReLU())
+        self.attention = GraphAttention(config.width, HEADS, config.init)
+        self.transform = nn.Sequential(
+            nn.Linear(config.width, config.feed_forward),
+            nn.ReLU(),
+            nn.Linear(config.feed_forward, config.width),
+        )
 
     def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
         """(B, N, W) -> (B, N, W); edges as for `GraphAttention`."""
@@ -89,13 +93,13 @@ class EncoderLayer(nn.Module):
 class GraphEncoder(nn.Module):
     """Embedding of the nodes and L rounds of message passing.
 
-    The embedding is linear and without bias, also a finding from the parameter count; Eq. 8 with
-    its ReLU would be g again.
+    The embedding has no bias, another finding from the parameter count.
     """
 
     def __init__(self, features: int, config: NetConfig) -> None:
         super().__init__()
-        self.embed = nn.Linear(features, config.width, bias=False)
+        bound = math.sqrt(12.0 / (features + config.width)) if config.init == "authors" else None
+        self.embed, self.rectified = Drawn(features, config.width, bound), config.rectified
         self.layers = nn.ModuleList([EncoderLayer(config) for _ in range(config.layers)])
 
     def forward(self, features: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
@@ -104,6 +108,8 @@ class GraphEncoder(nn.Module):
         Edges are (N, N), or (B, N, N).
         """
         nodes = self.embed(features)
+        if self.rectified:
+            nodes = torch.relu(nodes)
         for layer in self.layers:
             nodes = layer(nodes, edges)
         return nodes, nodes.mean(dim=1)

@@ -14,6 +14,7 @@ from tangram_agent.nets.attention import GraphEncoder
 from tangram_agent.nets.graph import Graph
 
 VELOCITY = 3
+_ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
 
 class Head(nn.Module):
@@ -49,8 +50,8 @@ class Head(nn.Module):
             self.context = nn.Linear(net.width, net.width, bias=False)
             self.readout = nn.Linear((1 + at_base) * net.width, outputs)
         else:
-            groups = graph.tokens if at_base else 1
-            self.layers = perceptron(graph.inputs + action, net.hidden, outputs * groups)
+            groups, kind = graph.tokens if at_base else 1, _ACTIVATIONS[net.activation]
+            self.layers = perceptron(graph.inputs + action, net.hidden, outputs * groups, kind=kind)
 
     def forward(
         self,
@@ -79,7 +80,9 @@ class Head(nn.Module):
             seen = torch.cat([seen, appended], dim=-1)
         nodes, mean = self.encoder(seen, self.graph.adjacency)
         read = self.context(mean)
-        outputs = self.readout(torch.cat([nodes[rows, base], read], -1) if self.at_base else read)
+        if self.at_base:
+            read = torch.cat([nodes[rows, base], read], -1)
+        outputs = self.readout(torch.relu(read) if self.encoder.rectified else read)
         return outputs
 
     def see(self, view: Any) -> Tensor:
@@ -89,22 +92,27 @@ class Head(nn.Module):
 
 
 def perceptron(
-    inputs: int, hidden: tuple[int, ...], outputs: int, norm: bool = False
+    inputs: int,
+    hidden: tuple[int, ...],
+    outputs: int,
+    norm: bool = False,
+    kind: type[nn.Module] = nn.ReLU,
 ) -> nn.Sequential:
-    """Linear layers with ReLU between, each normalised before it where `norm` says so."""
+    """Linear layers with ReLU or another kind between, normalised before it if `norm` says so."""
     layers: list[nn.Module] = []
     for size in hidden:
-        layers += [nn.Linear(inputs, size), *([nn.LayerNorm(size)] if norm else []), nn.ReLU()]
+        layers += [nn.Linear(inputs, size), *([nn.LayerNorm(size)] if norm else []), kind()]
         inputs = size
     return nn.Sequential(*layers, nn.Linear(inputs, outputs))
 
 
 def initialise(module: nn.Module, generator: torch.Generator) -> None:
-    """Uniform weights and biases within 1/sqrt(inputs), from an explicit generator."""
+    """Uniform weights and biases within 1/sqrt(inputs) or a layer's `bound`, by a generator."""
     with torch.no_grad():
         for layer in module.modules():
             if isinstance(layer, nn.Linear):
-                bound = 1.0 / math.sqrt(layer.weight[0].numel())
+                own: float | None = getattr(layer, "bound", None)
+                bound = own or 1.0 / math.sqrt(layer.weight[0].numel())
                 layer.weight.uniform_(-bound, bound, generator=generator)
                 if layer.bias is not None:
                     layer.bias.uniform_(-bound, bound, generator=generator)

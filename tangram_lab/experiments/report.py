@@ -33,6 +33,13 @@ LABELS = {
 }
 WHOLE = ("updates", "episodes", "parameters", "train_seconds")  # numbers without decimals
 RIVALS = {"position only": "--", "exact": ":"}  # levels beside curves
+DASHES = ("-.", (0, (1, 3)))  # of what is reported
+AXES = {  # of curves: what stands below, and up to where they are linear
+    "job": ("episodes of the paper", np.inf),
+    "simulations": ("simulations", 1000),
+    "episodes": ("episodes", 1000),
+    "train_seconds": ("seconds of training", 30),
+}
 
 
 # Tables
@@ -113,21 +120,28 @@ def _curves(
 ) -> Canvas:
     """Mean over the seeds and one standard deviation, over episodes and over seconds."""
     canvas, panels = new_figure(4.2, 2, sharey=True)
-    for panel, x in zip(panels, ("episodes", "train_seconds"), strict=True):
+    count = curves["episodes"]
+    whole = curves.assign(job=count / max(figure.job, 1), simulations=count)
+    columns = ("job", "simulations") if figure.job else ("episodes", "train_seconds")
+    for panel, x in zip(panels, columns, strict=True):
         for name, colour in zip(names, COLOURS, strict=False):
-            own = curves[curves["training"] == name]
+            own = whole[whole["training"] == name]
             every = [one.sort_values(x) for _, one in own.groupby("seed")]
             grid = np.linspace(0.0, min(one[x].max() for one in every), GRID)
             lines = np.stack([np.interp(grid, one[x], one[figure.measure]) for one in every])
             middle, spread = lines.mean(axis=0), lines.std(axis=0)
             panel.plot(grid, middle, color=colour, label=labels[name])
             panel.fill_between(grid, middle - spread, middle + spread, color=colour, alpha=0.15)
-        panel.set(xlabel="episodes" if x == "episodes" else "seconds of training")
-        panel.set_xscale("symlog", linthresh=1000 if x == "episodes" else 30)
+        text, linear = AXES[x]
+        panel.set(xlabel=text, xlim=(0.0, None))
+        if panel.get_xlim()[1] > 10.0 * linear:  # else its ticks would lie over each other
+            panel.set_xscale("symlog", linthresh=linear)
+        for (name, levels), dash in zip(figure.reported.items(), DASHES, strict=False):
+            panel.axhline(levels[0], color="#111827", linestyle=dash, label=name)
         for policy, dash in RIVALS.items():
-            levels = rows[(rows["policy"] == policy) & rows["training"].isin(names[:1])]
-            if len(levels):
-                level = levels[figure.measure].iloc[0]
+            own = rows[(rows["policy"] == policy) & rows["training"].isin(names[:1])]
+            if len(own):
+                level = own[figure.measure].iloc[0]
                 panel.axhline(level, color="#6B7280", linestyle=dash, label=policy)
     panels[0].set(ylabel=LABELS[figure.measure])
     legend_below(canvas, panels[0])
@@ -151,6 +165,8 @@ def _tests(
         if policy not in (AGENT, "random") and all(levels):
             middle = np.array([one.median for one in levels if one])
             panel.plot(place, middle, "k:", marker=".", alpha=0.6, label=f"{policy} (rival)")
+    for name, levels in figure.reported.items():
+        panel.plot(place, levels, "k--", marker="x", label=name)
     texts = [test.replace("_", " ") for test in figure.tests]
     panel.set_xticks(place, texts, rotation=30 if len(texts) > 6 else 0, ha="center")
     panel.set(ylabel=LABELS[figure.measure])

@@ -61,6 +61,9 @@ class Figure(msgspec.Struct, forbid_unknown_fields=True):
         measure: the column that is drawn.
         tests: of the kind `tests`.
         test: of the kind `seeds`.
+        reported: what somebody else reports: name -> a level, or a score for each test.
+        job: episodes of ours in one of the paper's, which the first panel of curves counts; 0: the
+            second panel counts seconds.
     """
 
     kind: Literal["curves", "tests", "seeds"]
@@ -69,6 +72,8 @@ class Figure(msgspec.Struct, forbid_unknown_fields=True):
     measure: str = "mean_reward"
     tests: tuple[str, ...] = ()
     test: str = ""
+    reported: dict[str, tuple[float, ...]] = {}
+    job: int = 0
 
 
 class Study(msgspec.Struct, forbid_unknown_fields=True):
@@ -126,7 +131,7 @@ class StudyConfig(Settings):
     """A study, and where and how it is run."""
 
     run_dir: str = field(metadata=declared("folder of all runs; what is there goes on"))
-    study: str = setting("paper", "of conf/studies.yaml: paper, paper_size, parts, game, ...")
+    study: str = setting("paper", "of conf/studies.yaml: paper, token, parts, game, ...")
     budget: str = setting("laptop", "smoke (minutes), laptop or paper (days)")
     seeds: int | None = setting(None, "of every training, at most; null is the budget's", low=1)
     out: str | None = setting(

@@ -40,7 +40,8 @@ class KinematicWorld:
     def picture(self) -> Pixels:
         """See `World.picture`."""
         corners = self._layout.corners(self._poses, self._flipped)
-        taken = rasterise(corners, self._layout, self._sim.arena, taken_pixels(self._sim))
+        shown = self._sim.arena * self._sim.view
+        taken = rasterise(corners, self._layout, shown, taken_pixels(self._sim))
         return averaged(taken, self._sim.pixels)
 
     def close(self) -> None:

@@ -35,8 +35,8 @@ def sample_batch(
 ) -> Floats:
     """One layout per generator: (B, K, 3) of x, y (arena units) and angle in (-pi, pi].
 
-    Centres lie in the square that keeps the token inside the arena at every angle, angles are
-    uniform, and no two tokens of a layout overlap.
+    Middles lie in the square that keeps the token inside the arena at every angle, or with
+    `sim.overhang` in the arena; angles are uniform, and no two tokens of a layout overlap.
 
     Args:
         layout: the tokens.
@@ -131,7 +131,7 @@ def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) ->
 
 
 def check_fits(layout: Layout, sim: SimConfig) -> Floats:
-    """(K,) largest coordinate of each token's centre; SamplingError if the arena is too small."""
+    """(K,) largest coordinate of each token's middle; SamplingError if the arena is too small."""
     reach: Floats = sim.arena / 2.0 - layout.radii
     if (reach < 0.0).any():
         worst = layout.shapes[int(np.argmin(reach))]
@@ -140,4 +140,4 @@ def check_fits(layout: Layout, sim: SimConfig) -> Floats:
             f"width {sim.arena:g} at every angle: raise sim.arena to at least "
             f"{2.0 * worst.radius:.3g}, or lower tokens.scale"
         )
-    return reach
+    return np.full(layout.tokens, sim.arena / 2.0) if sim.overhang else reach

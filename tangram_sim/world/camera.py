@@ -1,4 +1,4 @@
-"""The engine's camera: straight from above, exactly the arena."""
+"""The engine's camera: straight from above, exactly a square about the arena's middle."""
 
 import math
 
@@ -16,18 +16,18 @@ _DEPTH = 10.0
 class Camera:
     """A camera of one PyBullet client."""
 
-    def __init__(self, client: int, pixels: int, arena: float, top: float) -> None:
-        """Point the camera at the arena; its width and the height of what is seen, engine units."""
+    def __init__(self, client: int, pixels: int, width: float, top: float) -> None:
+        """Point the camera down; width of what it shows, and height of tokens, engine units."""
         self._client = client
         self._pixels = pixels
         # TinyRenderer samples a pixel at its lower left corner, so the camera stands half a pixel
         # to the right and up: then a pixel shows its centre.
-        shift, height = arena / pixels / 2.0, _CAMERA_HEIGHT + top
+        shift, height = width / pixels / 2.0, _CAMERA_HEIGHT + top
         self._view = pybullet.computeViewMatrix(
             (shift, shift, height), (shift, shift, 0.0), (0.0, 1.0, 0.0)
         )
         self._projection = pybullet.computeProjectionMatrixFOV(
-            math.degrees(2.0 * math.atan(arena / 2.0 / _CAMERA_HEIGHT)),
+            math.degrees(2.0 * math.atan(width / 2.0 / _CAMERA_HEIGHT)),
             1.0,
             _CAMERA_HEIGHT - _DEPTH,
             _CAMERA_HEIGHT + _DEPTH,

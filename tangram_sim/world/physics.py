@@ -75,7 +75,8 @@ class PhysicsWorld:
         self._play_at_once()
         if sim.pixels:
             self._pixels = sim.pixels
-            self._camera = Camera(self._client, taken_pixels(sim), ENGINE_ARENA, _HALF_HEIGHT)
+            shown = ENGINE_ARENA * sim.view
+            self._camera = Camera(self._client, taken_pixels(sim), shown, _HALF_HEIGHT)
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""

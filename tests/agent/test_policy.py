@@ -188,6 +188,16 @@ def test_noise_moves_the_velocity_by_its_spread_and_leaves_the_choice(
     assert abs(gap.mean()) < 0.01
 
 
+@pytest.mark.parametrize("times", [1, 2])
+def test_noise_inside_is_added_before_the_last_tanh(times: int) -> None:
+    agent = SCENE | NOISE | {"noise_inside": True, "actor_tanh": times}
+    plain, noisy = explored(setup(agent=agent), 500)
+    gap = np.arctanh(noisy) - np.arctanh(plain)
+    assert gap.std() == pytest.approx(0.05, rel=0.1)
+    assert abs(gap.mean()) < 0.01
+    assert np.abs(plain).max() < (np.tanh(1.0) if times == 2 else 1.0)
+
+
 def test_a_share_of_actions_is_uniform() -> None:
     plain, noisy = explored(setup(agent=SCENE | {"noise": 0.0, "uniform_share": 0.3}), 500)
     drawn = np.abs(noisy - plain).max(axis=1) > 1e-6

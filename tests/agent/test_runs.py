@@ -82,7 +82,7 @@ def test_a_broken_run_is_refused_in_clear_words(run_dir: Path, harm: Any, reason
     [
         ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
         ("agent", {"kind": "scene"}),
-        ("net", {**SMALL, "scale": "sqrt_d"}),
+        ("net", {**SMALL, "rectified": True}),
         ("sim", {"arena": 3.0}),
     ],
 )

@@ -68,7 +68,7 @@ def with_sections(config: dict[str, Any], more: dict[str, Any]) -> dict[str, dic
         (changed("net", width=65), "net.width must be a multiple of 4, got 65"),
         (changed("net", hidden=[]), "net.hidden must name at least one layer"),
         (changed("net", hidden=[0]), "net.hidden must be between 1 and 65536, got 0"),
-        (changed("net", scale="none"), "net.scale must be one of d, sqrt_d"),
+        (changed("net", init="none"), "net.init must be one of fan_in, authors"),
         ({n: BASE[n] for n in ("task", "tokens", "agent")}, "no section sim, reward, net"),
         (
             {"tokens": {}, "agent": {"kind": "pair"}},

@@ -275,7 +275,7 @@ def test_what_cannot_be_meant_is_told(tmp_path: Path, arguments: list[str], told
 
 
 def test_help_is_that_of_the_agent_that_is_named(tmp_path: Path) -> None:
-    for agent, setting in (("goal", "agent.moved_share"), ("mlp", "agent.saturation_penalty")):
+    for agent, setting in (("goal", "agent.relabel_share"), ("mlp", "agent.saturation_penalty")):
         assert setting in run_here(
             "tangram-train", f"agent={agent}", "--help", "agent", cwd=tmp_path
         )

@@ -36,8 +36,11 @@ SHORT = {
 SEED, ENVS, BATCH_EPISODES = 0, 4, 4
 PERTURBED, STEP, MARGIN = 12, 2.0**-22, 4.0
 AGENTS = {
-    "paper": ("agent=paper", "net=mha_small", "sim.pixels=64", "reward.source=camera"),
-    "perceptron": ("agent=mlp",),
+    "paper": (
+        *("agent=paper", "net=mha_small", "agent.actor_delay=3"),
+        *("sim=paper", "sim.pixels=64", "reward.source=camera"),
+    ),
+    "perceptron": ("agent=mlp", "agent.actor_delay=3"),
     "pairs": ("agent=tangram",),
     "seven": ("agent=tangram", "tokens=tangram7", "net=mlp_pairs"),
     "outline": ("task=fill", "agent=outline", "tokens=tangram7", "sim=silhouette"),

@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,8 @@ def test_mean_overlap_of_a_right_place_at_any_angle(shape: str, expected: float)
     assert got.mean() == pytest.approx(expected, abs=6e-4)
 
 
-ZERO = (math.sqrt(101.0) - 1.0) / 100.0
+SHARP = 200.0 * math.sqrt(2.0)
+ZERO = (math.sqrt(1.0 + SHARP) - 1.0) / SHARP
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -79,22 +81,36 @@ def test_no_reward_is_beyond_its_bounds(name: str, seed: int) -> None:
     poses = random_poses(rng, 40, layout.tokens, 8.0)
     poses[::2, :, :2] = 8.0 * np.sign(poses[::2, :, :2])
     corners = layout.corners(poses)
-    bound = float(np.abs(corners).max())
     found = make_reward(config, layout, sim)(corners[:20], corners[20:])
-    low, high = reward_bounds(config, sim, bound)
+    low, high = reward_bounds(config)
     assert low - 1e-9 <= found.min() <= found.max() <= high + 1e-9
 
 
+def test_a_goal_that_the_camera_does_not_show_pays_nothing() -> None:
+    layout, sim = layout_of("square"), SimConfig(pixels=64, view=2.5)
+    found = make_reward(RewardConfig(source="camera"), layout, sim)
+    poses = [
+        [[2.6, 0.0, 0.0]],
+        [[0.0, -2.75, 0.0]],
+        [[2.75, 2.6, 0.0]],
+    ]  # the second one is outside
+    corners = layout.corners(np.array(poses))
+    assert found(corners, corners).tolist() == pytest.approx([1.0, -1.0, -1.0])
+
+
+def test_a_camera_too_coarse_for_a_token_is_refused_with_the_least_that_does() -> None:
+    layout, config = layout_of("large_triangle", "square"), RewardConfig(source="camera")
+    for sim in (SimConfig(pixels=19), SimConfig(pixels=49, view=2.5)):
+        with pytest.raises(ConfigError, match=r"square covers .* of at least 16: raise") as told:
+            make_reward(config, layout, sim)
+        least = int(str(told.value).rpartition(" ")[2])
+        make_reward(config, layout, replace(sim, pixels=least))
+        with pytest.raises(ConfigError, match="of at least 16"):
+            make_reward(config, layout, replace(sim, pixels=least - 1))
+
+
 def test_closeness() -> None:
-    expected = {
-        0: 1,
-        0.001: 0.958696,
-        0.01: 0.699619,
-        ZERO: 0,
-        0.1: -0.039147,
-        1: -1,
-        1.5: -1.174280,
-    }
+    expected = {0: 1, 0.001: 0.911806, 0.01: 0.524662, ZERO: 0, 0.1: -0.195750, 1: -1, 1.5: -1}
     got = closeness(3.0 * np.array(list(expected)), 3.0)
     np.testing.assert_allclose(got, list(expected.values()), atol=1e-6)
 

@@ -21,7 +21,7 @@ class GaussianPolicy(Policy):
 
     def __init__(self, inputs: int, actions: int, config: BaseConfig) -> None:
         super().__init__(inputs, actions, config)
-        self.layers = perceptron(inputs, config.hidden, 2 * actions, config.layer_norm)
+        self.layers = perceptron(inputs, config.hidden, 2 * actions, norm=True)
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B, A) the mean's action."""

@@ -6,7 +6,7 @@ from typing import ClassVar, cast
 from tangram_agent.flat.config import EpisodeConfig
 from tangram_core.agent import Actor, Agent, Learner, Pace
 from tangram_core.errors import ConfigError
-from tangram_core.settings import LEARNING, NETWORK, setting
+from tangram_core.settings import NETWORK, setting
 from tangram_core.task import Json, Task
 from tangram_tasks.push.task import Push
 
@@ -29,16 +29,6 @@ class PushingConfig(EpisodeConfig, section="agent"):
         "friction, before one is played; 0: none, and none while it learns",
         low=0,
         high=1024,
-    )
-    targets_looked_at: int = setting(
-        8, "the same in the target of an update", low=2, high=1024, part=LEARNING
-    )
-    some_share: float = setting(
-        0.3,
-        "share of the goals of hindsight that are another for some of the tokens alone",
-        low=0,
-        high=1,
-        part=LEARNING,
     )
 
 

@@ -37,6 +37,8 @@ _PAIR = 2  # tokens whose pushes a target looks at
 _LOST = 2.0  # what it costs to push a third token out of its place: some pushes until it is back
 _RENEWED = 20  # updates after which the table of pushes is
 _LAST = 0.1  # share of the learning rate that is left at the end of a budget
+_LOOKED_AT = 8  # pushes of each token of which a target takes the best
+_SOME_SHARE = 0.3  # of the goals of hindsight that are another for some of the tokens alone
 _STILL = 1e-4  # way of a token that did not move
 _TURN = 0.2  # length that a turn by one radian counts as
 
@@ -84,8 +86,6 @@ def lengths(terminated: Array) -> Ints:
 class PushReplay(EpisodeReplay):
     """Goals of hindsight are what was reached, for all tokens or for some."""
 
-    some_share = 0.0
-
     def chosen(self, config: EpisodeConfig, rng: Streams) -> tuple[Ints, Ints, Array]:
         """Which episodes (B,) and steps (B,) before all was in place, and goals (B, V, 2).
 
@@ -107,7 +107,7 @@ class PushReplay(EpisodeReplay):
         """See `EpisodeReplay.relabelled`."""
         layout = self._task.layout  # type: ignore[attr-defined]
         own = rng.random((len(desired), layout.tokens)) < 0.5
-        own |= (rng.random(len(desired)) >= self.some_share)[:, None]
+        own |= (rng.random(len(desired)) >= _SOME_SHARE)[:, None]
         mask = own[:, layout.token_of_corner, None]
         return np.where(mask, reached, desired)
 
@@ -133,7 +133,6 @@ class PushLearner(NetworkLearner):
         place = torch.device(device)
         self._tokens = Tokens(task, place)
         self.replay = PushReplay(task, config.replay_capacity)
-        self.replay.some_share = config.some_share
         self.capacity = self.replay.capacity * task.spec.horizon
         corners = task.layout.padded_corners.shape[1]
         with torch.random.fork_rng(devices=[]):  # what others draw from torch stays as it is
@@ -227,7 +226,7 @@ class PushLearner(NetworkLearner):
         """(B,) r + gamma (1 - d) max Q', within what rewards can add up to."""
         tokens, config = self._tokens, self.config
         critic: Twins = self.targets["critic"]  # type: ignore[assignment]
-        scene, count = seen.at(seen.following), config.targets_looked_at
+        scene, count = seen.at(seen.following), _LOOKED_AT
         pair = torch.stack([seen.slots, seen.others], dim=1)
         pairs = torch.stack([pair, pair.flip(1)])
         search = Search(seen.drawn, count)

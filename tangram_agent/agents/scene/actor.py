@@ -6,10 +6,10 @@ Legend: B environments.
 import numpy as np
 import torch
 
+from tangram_agent.agents.scene.agent import SceneConfig
 from tangram_agent.agents.scene.networks import ActorNet
 from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.base.acting import NetworkActor, tensor
-from tangram_agent.base.config import ActorCriticConfig
 from tangram_core.arrays import Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Generators, History
@@ -21,7 +21,7 @@ from tangram_tasks.played import closed
 class SceneActor(NetworkActor):
     """The next token in the set's order, by the actor's velocity."""
 
-    def __init__(self, task: Place, config: ActorCriticConfig, network: ActorNet) -> None:
+    def __init__(self, task: Place, config: SceneConfig, network: ActorNet) -> None:
         super().__init__(network)
         self._task, self._config = task, config
 
@@ -31,15 +31,20 @@ class SceneActor(NetworkActor):
         token = next_token(flags)
         with torch.inference_mode():
             scenes = Scenes(tensor(seen["corners"]), flags, tensor(seen["goals"]), token)
-            velocity, _ = self.network(scenes)
+            velocity, raw = (one.numpy() for one in self.network(scenes))
+        if explore is not None:
+            velocity = self._explored(velocity, raw, explore)
         stay, count = np.zeros(len(token), np.bool_), self._task.layout.tokens
-        actions = make_actions(token.numpy(), velocity.numpy(), stay, count, self._task.sim)
-        if explore is None:
-            return actions
-        for action, generator in zip(actions, explore, strict=True):
-            velocity_of = action[-3:]
-            if generator.random() < self._config.uniform_share:
-                velocity_of[:] = generator.uniform(-1.0, 1.0, 3)
-            else:
-                velocity_of += self._config.noise * generator.standard_normal(3)
-        return np.clip(actions, -1.0, 1.0)
+        return make_actions(token.numpy(), velocity, stay, count, self._task.sim)
+
+    def _explored(self, velocity: Singles, raw: Singles, explore: Generators) -> Singles:
+        """Velocities (B, 3) with noise, before the last tanh or after it; some are uniform."""
+        config, rows = self._config, []
+        for own, before, generator in zip(velocity, raw, explore, strict=True):
+            uniform = generator.random() < config.uniform_share
+            drawn = generator.uniform(-1.0, 1.0, 3) if uniform else generator.standard_normal(3)
+            noise = config.noise * drawn
+            noisy = np.tanh(before + noise) if config.noise_inside else own + noise
+            rows.append(drawn if uniform else noisy)
+        explored: Singles = np.clip(np.stack(rows), -1.0, 1.0).astype(np.float32)
+        return explored

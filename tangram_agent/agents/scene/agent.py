@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 from tangram_agent.base.agent import TokenAgent, seen_tokens
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
+from tangram_core.settings import LEARNING, NETWORK, setting
 from tangram_core.task import Task
 from tangram_tasks.place import Place
 
@@ -16,12 +17,32 @@ if TYPE_CHECKING:  # need torch
 
 
 @dataclass(frozen=True)
+class SceneConfig(ActorCriticConfig, section="agent"):
+    """DDPG and hindsight on whole scenes, with what the paper leaves open."""
+
+    flags: bool = setting(
+        True,
+        "whether networks are told which tokens are placed; no: attention is told that all are, a "
+        "perceptron sees coordinates alone",
+        part=NETWORK,
+    )
+    actor_tanh: int = setting(
+        1, "times that tanh is applied to the actor's output", low=1, high=2, part=NETWORK
+    )
+    critic_tanh: bool = setting(False, "whether it is applied to the critic's, too", part=NETWORK)
+    noise_inside: bool = setting(
+        False, "exploration noise is added before the last tanh, not after it", part=LEARNING
+    )
+    actor_delay: int = setting(1, "updates for each one of the actor", low=1, part=LEARNING)
+
+
+@dataclass(frozen=True)
 class Scene(TokenAgent):
     """One velocity for the next token, one value of the whole scene."""
 
-    sections: ClassVar = {"agent": ActorCriticConfig, "net": NetConfig}
+    sections: ClassVar = {"agent": SceneConfig, "net": NetConfig}
 
-    config: ActorCriticConfig
+    config: SceneConfig
 
     def check(self, task: Task) -> None:
         """It plays tokens whose target is seen."""
@@ -38,8 +59,11 @@ class Scene(TokenAgent):
     def networks(self, layout: "Layout") -> "tuple[ActorNet, CriticNet]":
         """Actor and critic, with whatever weights; another kind of them overrides this."""
         from tangram_agent.agents.scene.networks import ActorNet, CriticNet  # noqa: PLC0415
+        from tangram_agent.agents.scene.scenes import SceneGraph  # noqa: PLC0415
 
-        return ActorNet(layout, self.net), CriticNet(layout, self.net)
+        graph = SceneGraph(layout, self.config.flags)
+        actor = ActorNet(graph, self.net, tanh=self.config.actor_tanh)
+        return actor, CriticNet(graph, self.net, tanh=self.config.critic_tanh)
 
     def learns(self) -> "type[SceneLearner]":
         """With actor and critic."""

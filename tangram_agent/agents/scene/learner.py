@@ -22,6 +22,7 @@ class SceneLearner(Ddpg):
         self, agent: Scene, task: Place, seed: int, device: str, compiled: bool = False
     ) -> None:
         actor, critic = agent.networks(task.layout)
+        self.delay = agent.config.actor_delay
         super().__init__(task, agent.config, (actor, critic, actor), seed, device, compiled)
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:  # noqa: ARG002
@@ -41,6 +42,7 @@ class SceneLearner(Ddpg):
             done=self.tensor(batch.done),
             start=start,
             follow=self.if_any_follows(batch.done, follow),
+            acts=self.updates % self.delay == self.delay - 1,
         )
 
     def features(self, steps: Steps) -> Tensor | None:

@@ -12,33 +12,38 @@ from torch import Tensor, nn
 from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
 from tangram_agent.base.config import NetConfig
 from tangram_agent.nets.networks import VELOCITY, Head
-from tangram_sim.geometry.layout import Layout
 
 
 class ActorNet(nn.Module):
     """pi(s, g): which velocity to give to the token that is to move; tanh bounds it."""
 
-    def __init__(self, layout: Layout, net: NetConfig, head: Callable[..., Any] = Head) -> None:
-        """Make it of layers that are made and called as `Head` is."""
+    def __init__(
+        self, graph: SceneGraph, net: NetConfig, head: Callable[..., Any] = Head, tanh: int = 1
+    ) -> None:
+        """Make it of layers that are made and called as `Head` is; tanh is applied so often."""
         super().__init__()
-        self.head = head(SceneGraph(layout), net, VELOCITY, at_base=True)
+        self.head, self._inner = head(graph, net, VELOCITY, at_base=True), tanh - 1
 
     def forward(self, scenes: Scenes, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Velocity (M, 3) in [-1, 1] in the arena's axes, and its pre-activations (M, 3).
+        """Velocity (M, 3) in [-1, 1] in the arena's axes, and (M, 3) before the last tanh.
 
         Features are as for `Head`.
         """
         raw = self.head(scenes, features=features)
+        for _ in range(self._inner):
+            raw = torch.tanh(raw)
         return torch.tanh(raw), raw
 
 
 class CriticNet(nn.Module):
     """Q(s, g, a): what a velocity of the token that is to move is worth (Eq. 3)."""
 
-    def __init__(self, layout: Layout, net: NetConfig, head: Callable[..., Any] = Head) -> None:
-        """Make it of layers that are made and called as `Head` is."""
+    def __init__(
+        self, graph: SceneGraph, net: NetConfig, head: Callable[..., Any] = Head, tanh: bool = False
+    ) -> None:
+        """Make it of layers that are made and called as `Head` is, with tanh or without."""
         super().__init__()
-        self.head = head(SceneGraph(layout), net, 1, at_base=False, action=VELOCITY)
+        self.head, self._tanh = head(graph, net, 1, at_base=False, action=VELOCITY), tanh
 
     def forward(
         self,
@@ -49,4 +54,4 @@ class CriticNet(nn.Module):
     ) -> Tensor:
         """Values (M,) of velocities (M, 3); features are as for `Head`."""
         value: Tensor = self.head(scenes, action=velocity, features=features).squeeze(-1)
-        return value
+        return torch.tanh(value) if self._tanh else value

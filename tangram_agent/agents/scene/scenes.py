@@ -41,10 +41,12 @@ class SceneGraph(nn.Module):
     adjacency: Tensor
     target_flag: Tensor
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, flags: bool = True) -> None:
+        """Without flags of what is placed all nodes carry a 1, and vectors are positions alone."""
         super().__init__()
         self.tokens, self.corners, self.nodes = layout.tokens, layout.corner_count, layout.nodes
-        self.features, self.inputs = 4, 4 * self.nodes
+        self.features, self.flags = 4, flags
+        self.inputs = (4 if flags else 2) * self.nodes
         target_flag = torch.zeros(layout.nodes)
         target_flag[layout.corner_count + layout.tokens :] = 1.0
         constants = {
@@ -64,11 +66,13 @@ class SceneGraph(nn.Module):
         """Features (M, N, F): position, whether it is the target's, whether it is placed."""
         corners, goal = scenes.corners, scenes.goal
         positions = torch.cat([corners, self.base_weights @ corners, goal], dim=1)
-        flags = torch.cat([scenes.placed[:, self.token_of_corner], scenes.placed], dim=1)
+        placed = scenes.placed if self.flags else torch.ones_like(scenes.placed)
+        flags = torch.cat([placed[:, self.token_of_corner], placed], dim=1)
         flags = nn.functional.pad(flags, (0, self.corners), value=1.0)
         target = self.target_flag.expand_as(flags)
         return torch.cat([positions, torch.stack([target, flags], dim=-1)], dim=-1)
 
     def vectors(self, scenes: Scenes) -> Tensor:
         """(M, inputs): the features of all nodes in one row."""
-        return self.node_features(scenes).flatten(1)
+        features = self.node_features(scenes)
+        return (features if self.flags else features[..., :2]).flatten(1)

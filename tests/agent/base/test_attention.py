@@ -20,14 +20,15 @@ pytestmark = pytest.mark.fast
 WIDTH, HEADS, NODES = 16, 4, 9
 
 
-def attention(scale: str = "d") -> GraphAttention:
-    layer = GraphAttention(WIDTH, HEADS, scale)
+def attention() -> GraphAttention:
+    layer = GraphAttention(WIDTH, HEADS, "fan_in")
     initialise(layer, torch.Generator().manual_seed(3))
     return layer
 
 
-def slow_attention(layer: GraphAttention, nodes: np.ndarray, edges: np.ndarray, d: float):
-    """Eqs. 9-12 for one graph, node by node and head by head."""
+def slow_attention(layer: GraphAttention, nodes: np.ndarray, edges: np.ndarray):
+    """Eqs. 9-12 for one graph, node by node and head by head; d is the root of the key width."""
+    d = 2.0
     count, width = nodes.shape
     key_width = width // layer.heads
     stacked = layer.query_key_value.weight.detach().numpy().astype(np.float64)
@@ -44,20 +45,19 @@ def slow_attention(layer: GraphAttention, nodes: np.ndarray, edges: np.ndarray, 
     return result
 
 
-@pytest.mark.parametrize(("scale", "d"), [("d", 4.0), ("sqrt_d", 2.0)])
-def test_attention_equals_the_loop_of_the_equations(scale: str, d: float) -> None:
-    layer = attention(scale)
+def test_attention_equals_the_loop_of_the_equations() -> None:
+    layer = attention()
     edges = setup().task.layout.adjacency
     nodes = np.random.default_rng(0).standard_normal((5, NODES, WIDTH)).astype(np.float32)
     fast = layer(torch.from_numpy(nodes), torch.from_numpy(edges)).detach().numpy()
     for graph, expected in zip(nodes, fast, strict=True):
-        np.testing.assert_allclose(slow_attention(layer, graph, edges, d), expected, atol=1e-5)
+        np.testing.assert_allclose(slow_attention(layer, graph, edges), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("feed_forward", [0, 20])
-def test_encoder_equals_the_loop_of_the_equations(feed_forward: int) -> None:
-    """Eq. 13 with both readings of g, over two rounds."""
-    config = NetConfig(width=WIDTH, layers=2, feed_forward=feed_forward)
+@pytest.mark.parametrize("rectified", [False, True])
+def test_encoder_equals_the_loop_of_the_equations(rectified: bool) -> None:
+    """Eq. 13 over two rounds, with both readings of the embedding."""
+    config = NetConfig(width=WIDTH, layers=2, feed_forward=20, rectified=rectified)
     encoder = GraphEncoder(4, config)
     initialise(encoder, torch.Generator().manual_seed(1))
     edges = setup().task.layout.adjacency
@@ -65,8 +65,9 @@ def test_encoder_equals_the_loop_of_the_equations(feed_forward: int) -> None:
     found, mean = encoder(torch.from_numpy(features), torch.from_numpy(edges))
 
     nodes = features[0].astype(np.float64) @ encoder.embed.weight.detach().numpy().T
+    nodes = np.maximum(nodes, 0.0) if rectified else nodes
     for layer in encoder.layers:
-        nodes = nodes + slow_attention(layer.attention, nodes, edges, 4.0)
+        nodes = nodes + slow_attention(layer.attention, nodes, edges)
         hidden = nodes
         for part in layer.transform:
             if isinstance(part, torch.nn.Linear):
@@ -76,6 +77,22 @@ def test_encoder_equals_the_loop_of_the_equations(feed_forward: int) -> None:
         nodes = nodes + hidden
     np.testing.assert_allclose(found[0].detach().numpy(), nodes, atol=1e-5)
     np.testing.assert_allclose(mean[0].detach().numpy(), nodes.mean(axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("init", "embedding", "keys"),
+    [("fan_in", 1 / 2, 1 / 4), ("authors", (12 / (4 + WIDTH)) ** 0.5, 1 / 2)],
+)
+def test_weights_are_drawn_within_their_bounds(init: str, embedding: float, keys: float) -> None:
+    encoder = GraphEncoder(4, NetConfig(width=WIDTH, init=init))
+    initialise(encoder, torch.Generator().manual_seed(1))
+    attention = encoder.layers[0].attention
+    for layer, bound in (
+        (encoder.embed, embedding),
+        (attention.query_key_value, keys),
+        (attention.combine, 1 / 4),
+    ):
+        assert 0.9 * bound < layer.weight.detach().abs().max().item() < 1.0001 * bound
 
 
 def test_without_an_edge_there_is_no_influence() -> None:

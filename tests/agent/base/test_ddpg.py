@@ -206,6 +206,16 @@ def test_an_update_moves_each_network_and_drags_the_averages() -> None:
     assert learner.updates == after["updates"][0] == 1001
 
 
+def test_the_actor_moves_in_one_of_so_many_updates() -> None:
+    made = setup(agent=SCENE | {"actor_delay": 3})
+    learner, moved = learner_of(made), list[bool]()
+    for number in range(6):
+        before = copied(learner)
+        play(learner, made, [number])
+        moved.append("actor" in changed(before, learner.state()))
+    assert moved == [False, False, True] * 2
+
+
 @pytest.mark.parametrize("case", [("ddpg", "tangram"), ("pairs", "mlp")])
 def test_the_actor_step_leaves_the_critic_alone(case: tuple[str, str]) -> None:
     """The critic's own step uses the critic's loss only: spoil the actor, the critic agrees."""

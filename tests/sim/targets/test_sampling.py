@@ -63,11 +63,12 @@ def test_tokens_lie_inside_and_apart(layout: Layout, arena: float) -> None:
     assert max(largest_overlap(layout, one) for one in poses) < 1e-7 * arena**2
 
 
-def test_positions_and_angles_are_uniform() -> None:
-    layout, sim = layout_of("square"), SimConfig()
+@pytest.mark.parametrize("overhang", [False, True])
+def test_positions_and_angles_are_uniform(overhang: bool) -> None:
+    layout, sim = layout_of("square"), SimConfig(overhang=overhang)
     rng = np.random.default_rng(0)
     poses = sample_batch(layout, sim, [rng] * 20_000)[:, 0]
-    reach = 1.0 - layout.shapes[0].radius
+    reach = 1.0 if overhang else 1.0 - layout.shapes[0].radius
     for column, bound in zip(poses.T, (reach, reach, np.pi), strict=True):
         counts, _ = np.histogram(column, bins=10, range=(-bound, bound))
         assert counts.sum() == 20_000  # nothing outside

@@ -133,14 +133,18 @@ def test_picture_of_a_token_in_the_upper_right(make: WorldMaker) -> None:
     np.testing.assert_array_equal(picture, expected)
 
 
-@pytest.mark.parametrize(("pixels", "arena"), [(16, 2.0), (63, 2.0), (64, 0.02), (200, 0.02)])
-def test_pictures_show_pixel_centres(make: WorldMaker, pixels: int, arena: float) -> None:
+@pytest.mark.parametrize(
+    ("pixels", "arena", "view"), [(16, 2.0, 1.0), (63, 2.0, 1.0), (64, 0.02, 1.0), (200, 0.02, 2.5)]
+)
+def test_pictures_show_pixel_centres(
+    make: WorldMaker, pixels: int, arena: float, view: float
+) -> None:
     """Pixel for pixel: half a pixel of shift would show, and so would a wrong field of view."""
     layout = layout_of(*TRIO, scale=0.4 * arena)
-    world, wrong = make(layout, pixels=pixels, arena=arena), 0
+    world, wrong = make(layout, pixels=pixels, arena=arena, view=view), 0
     for poses in random_poses(np.random.default_rng(0), 25, 3, 0.5 * arena):
         world.place(poses)
-        exact = rasterise(layout.corners(poses), layout, arena, pixels)
+        exact = rasterise(layout.corners(poses), layout, view * arena, pixels)
         wrong += int(np.count_nonzero(world.picture() != exact))
     # A pixel whose centre lies on an edge to rounding may fall on either side.
     assert wrong <= 10 * pixels / 64

@@ -238,9 +238,9 @@ def eleven(camera: Floats | None) -> tuple[Layout, Played]:
 def test_the_scores_of_a_known_set() -> None:
     layout, made = eleven(np.full(11, 0.25))
     scores = summarise(layout, SimConfig(), made, own_reward=True)
-    # Eq. 15: 1 - 2 log(1 + 100 d / reach) / log(101), reach the diagonal of the arena
-    distances = np.arange(11) * 0.01 / math.sqrt(8.0)
-    dense = np.mean(1.0 - 2.0 * np.log1p(100.0 * distances) / math.log(101.0))
+    # Eq. 15: 1 - 2 log(1 + d / 0.01) / log(1 + D / 0.01), D the diagonal of the arena
+    whole = math.log1p(math.sqrt(8.0) / 0.01)
+    dense = np.mean(1.0 - 2.0 * np.log1p(np.arange(11)) / whole)
     assert scores == pytest.approx(
         {
             "mean_reward": 0.0,

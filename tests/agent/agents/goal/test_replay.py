@@ -18,7 +18,7 @@ from tests.agent.agents.goal.worlds import Line
 pytestmark = pytest.mark.fast
 
 TASK = Line()
-CONFIG = BaseConfig(batch_size=400, moved_share=0.0, relabel_share=0.5)
+CONFIG = BaseConfig(batch_size=400, relabel_share=0.5)
 
 
 def streams(seed: int = 0) -> Streams:
@@ -121,10 +121,10 @@ def test_several_kinds_are_as_often() -> None:
 
 def test_a_share_comes_of_episodes_that_moved() -> None:
     kept = replay(1000, episodes(*range(1, 10), moves=False), episodes(10))
-    found = sample(kept, replace(CONFIG, moved_share=0.5))
+    found = sample(kept, CONFIG)
     assert 0.45 < (found.before >= 1000).mean() < 0.65
     still = replay(1000, episodes(1, 2, moves=False))  # none moved: any will do
-    assert len(sample(still, replace(CONFIG, moved_share=0.5)).before) == 400
+    assert len(sample(still, CONFIG).before) == 400
 
 
 @pytest.mark.parametrize("added", [2, 3, 7])

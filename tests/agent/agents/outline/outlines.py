@@ -26,7 +26,7 @@ def outline_setup(
     """A kinematic one with a small network, of corners unless another one is given."""
     flips = {"allow_flip": True} if "parallelogram" in tokens["shapes"] else {}
     own = AGENT | (agent or {})
-    return setup(tokens, own, net or SMALL | {"scale": "sqrt_d"}, **(SIM | flips | sim))
+    return setup(tokens, own, net or SMALL, **(SIM | flips | sim))
 
 
 def played_in(made: Setup, ways: list[Floats], goal: Floats) -> Episodes:

@@ -32,9 +32,7 @@ from tests.sim.builders import SEVEN
 pytestmark = pytest.mark.fast
 
 CPU = torch.device("cpu")
-SMALL = PushingConfig(
-    width=8, batch_size=16, learning_starts=16, replay_capacity=200, looked_at=4, some_share=0.5
-)
+SMALL = PushingConfig(width=8, batch_size=16, learning_starts=16, replay_capacity=200, looked_at=4)
 SQUARE = Push(TokensConfig(("square",), 1.1))
 TWO = Push(TokensConfig(("square", "small_triangle"), 1.1))
 SOME = Push(TokensConfig(tuple(SEVEN), 0.6), PushConfig(count=3))
@@ -356,7 +354,6 @@ def test_no_more_pushes_are_tried_than_there_are() -> None:
 
 def test_hindsight_takes_whole_tokens_of_what_was_reached() -> None:
     replay, layout = PushReplay(SOME, 100), SOME.layout
-    replay.some_share = 0.5
     shape = (200, layout.corner_count, 2)
     desired, reached = np.zeros(shape, np.float32), np.ones(shape, np.float32)
     found = replay.relabelled(desired, reached, np.random.default_rng(0))
@@ -364,7 +361,7 @@ def test_hindsight_takes_whole_tokens_of_what_was_reached() -> None:
     for token in tokens:
         assert (token == token[:, :1]).all()
     whole = np.stack([token[:, 0] for token in tokens], axis=1).all(axis=1)
-    assert 60 < whole.sum() < 140
+    assert 110 < whole.sum() < 170
 
 
 def test_targets_pay_and_end_as_the_task_does(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from conf.cli import composed
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
 from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
 from tangram_agent.nets.networks import initialise, parameter_count
-from tangram_core.setup import Setup
+from tangram_core.setup import Setup, make_setup
 from tests.agent.builders import PAIR, PAPER, SMALL, random_transitions, setup
 
 pytestmark = pytest.mark.fast
@@ -19,7 +20,7 @@ NETS: dict[str, Any] = {"mha": SMALL, "mlp": {"kind": "mlp"}}
 
 
 def networks(made: Setup, seed: int = 0) -> tuple[SceneGraph, ActorNet, CriticNet]:
-    actor, critic = (kind(made.task.layout, made.agent.net) for kind in (ActorNet, CriticNet))
+    actor, critic = made.agent.networks(made.task.layout)
     generator = torch.Generator().manual_seed(seed)
     initialise(actor, generator)
     initialise(critic, generator)
@@ -34,16 +35,16 @@ def inputs(made: Setup, count: int = 5) -> Scenes:
 
 
 @pytest.mark.parametrize(
-    ("net", "sizes", "total"),
+    ("told", "sizes", "total"),
     [
-        ({}, (252_227, 252_097), 504_324),
-        ({"kind": "mlp"}, (6_723, 6_785), 13_508),
-        ({"kind": "mlp", "hidden": [482, 482]}, (252_089, 252_569), 504_658),
-        ({"feed_forward": 0}, (66_371, 66_241), 132_612),  # the literal reading of g
+        ("agent=paper", (252_227, 252_097), 504_324),
+        ("agent=mlp", (6_851, 7_217), 14_068),
+        ("agent=mlp net=mlp_large", (237_123, 237_489), 474_612),
     ],
 )
-def test_sizes_of_table_1(net: dict[str, Any], sizes: tuple[int, int], total: int) -> None:
-    _, actor, critic = networks(setup(agent=PAPER, net=net))
+def test_sizes_of_table_1(told: str, sizes: tuple[int, int], total: int) -> None:
+    made = make_setup(composed("train", ["run_dir=x", "sim=paper", *told.split()]))
+    _, actor, critic = networks(made)
     assert (parameter_count(actor), parameter_count(critic)) == sizes
     assert parameter_count(actor, critic) == total
 
