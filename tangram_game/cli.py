@@ -44,37 +44,77 @@ def _evaluate(settings: Plain) -> int:
 
 
 def _play(settings: Plain) -> int:
-    from tangram_core.errors import ConfigError
     from tangram_core.setup import from_mapping
     from tangram_core.store.files import check_writable
-    from tangram_core.task import Task
-    from tangram_game.config import PLAN, PlayConfig
+    from tangram_game.config import PlayConfig
 
     paths = _with_figures(with_changes(with_absolute_paths(settings)))
     config = from_mapping(PlayConfig, paths)
     check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
     stored = _check_played(config)
-    if Path(config.out).suffix == PLAN and type(stored.setup.task).plan is Task.plan:
-        kind = stored.setup.task_kind
-        raise ConfigError(
-            f"out={config.out}: task={kind} makes no plan: set out=play.gif, or "
-            "run_dir=pretrained/hand, which does"
-        )
-    if config.target is not None:
-        from tangram_game.figures.photographs import read_photograph
-
-        read_photograph(config.target, stored.task)
+    _check_data(config, stored)
+    if config.target is not None or config.data:
+        recognised = _recognised(config, stored)
+        if recognised is None:
+            return 0
+        config = recognised
     filled = None
     if config.silhouette is not None:
         from tangram_game.figures.silhouettes import read_silhouette
 
-        out = Path(config.out)
-        filled = read_silhouette(config.silhouette, stored.task, config.solutions, out)
+        filled = read_silhouette(config.silhouette, stored.task, config.solutions)
     tell(f"loads and plays {config.run}")
     from tangram_game.play import play_run
 
     return play_run(config, filled)
+
+
+def _check_data(config: "PlayConfig", stored: "Run") -> None:
+    """Refuse data that nothing writes: a solution is one of a figure, a plan is of pushes."""
+    from tangram_core.errors import ConfigError
+    from tangram_core.task import Task
+
+    plans = type(stored.setup.task).plan is not Task.plan
+    figure = config.target or config.silhouette
+    if config.data and figure is None and not (plans and Path(config.out).suffix == ".json"):
+        raise ConfigError(
+            f"out={config.out} is for where tokens lie in a figure, or a finger's way: add "
+            "target=cat or a file, or name run_dir=pretrained/hand out=plan.json"
+        )
+
+
+def _recognised(config: "PlayConfig", stored: "Run") -> "PlayConfig | None":
+    """The settings with what `target` turns out to be; None where data were all that was asked for.
+
+    Raises:
+        ConfigError: it cannot be used.
+    """
+    from dataclasses import replace
+
+    from tangram_game.figures import targets
+
+    figure = config.target or config.silhouette
+    if figure is None:
+        return config
+    kind = targets.SILHOUETTE
+    if config.target is not None:
+        kind = targets.told_apart(figure, stored.task)
+        print(f"target={figure} is taken for {targets.TOLD[kind]}")
+    if config.data:
+        from tangram_core.store.files import write_whole
+
+        source = f"{'silhouette' if config.target is None else 'target'}={figure}"
+        solution = targets.solved(figure, source, stored.task, kind)
+        as_json = Path(config.out).suffix == ".json"
+        write_whole(Path(config.out), solution.json() if as_json else solution.svg())
+        print(f"{config.out}: {solution.told}")
+        return None
+    if kind == targets.PUZZLE:
+        return replace(config, target=None, puzzle=(figure,))
+    if kind == targets.SILHOUETTE:
+        return replace(config, target=None, silhouette=figure)
+    return config
 
 
 def _with_figures(settings: Plain) -> Plain:
@@ -125,8 +165,7 @@ def _check_drawings(config: "PlayConfig") -> None:
     from tangram_sim.puzzles.sketches import check_file
 
     for name, path in (("target", config.target), ("silhouette", config.silhouette)):
-        # A silhouette may be the name of a puzzle.
-        if path is not None and (name == "target" or Path(path).suffix):
+        if path is not None and Path(path).suffix:  # else the name of a puzzle
             check_file(Path(path), f"{name}={path}")
 
 
@@ -147,11 +186,12 @@ def with_absolute_paths(settings: Plain) -> Plain:
     from tangram_sim.puzzles.figures import SPLITS
 
     result = dict(settings)
-    for name in ("run_dir", "out", "sheet", "target"):
+    for name in ("run_dir", "out", "sheet"):
         result[name] = _absolute(result.get(name), is_run=name == "run_dir")
-    silhouette = result.get("silhouette")
-    if isinstance(silhouette, str) and Path(silhouette).suffix:  # else a puzzle's name
-        result["silhouette"] = _absolute(silhouette, is_run=False)
+    for name in ("target", "silhouette"):
+        value = result.get(name)
+        if isinstance(value, str) and Path(value).suffix:  # else a puzzle's name
+            result[name] = _absolute(value, is_run=False)
     puzzle = check_puzzle(result.get("puzzle"))
     if puzzle is not None and is_puzzle_source(puzzle[0]) and puzzle[0] not in SPLITS:
         puzzle = (str(_absolute(puzzle[0], is_run=False)), *puzzle[1:])

@@ -10,7 +10,6 @@ from typing import Any
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_core.errors import ConfigError
 from tangram_core.settings import Settings, check_folder, refuse_ignored, setting, told
-from tangram_sim.config import SILHOUETTE
 from tangram_sim.puzzles.figures import SPLITS
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
@@ -22,8 +21,8 @@ MAX_SOLUTIONS = 20
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
 ALL = ("all",)
 PICTURES = (".gif", ".mp4", ".png")
-PLAN = ".json"
-WRITTEN = (*PICTURES, PLAN)
+DATA = (".json", ".svg")
+WRITTEN = (*PICTURES, *DATA)
 MAX_SEED = 2**63 - 1
 PUZZLE_FILES = (".json", ".svg")
 PUZZLE_HELP = (
@@ -108,11 +107,6 @@ class EvalConfig(Settings):
             raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
         if self.puzzle is not None:
             _refuse(self.changes, OF_TARGETS, "puzzle", "leave puzzle out")
-        observe = self.changes.get("sim", {}).get("observe")
-        if self.puzzle is None and observe == SILHOUETTE:
-            raise ConfigError(
-                f"sim.observe={observe} hides the pieces of puzzles, got none: add puzzle=test"
-            )
 
     @property
     def run(self) -> str:
@@ -166,7 +160,8 @@ class PlayConfig(Settings):
     )
     out: str = setting(
         "play.gif",
-        ".gif or .mp4 for an animation, .png for one picture, .json for a finger's way points",
+        ".gif or .mp4 for an animation, .png for one picture; .json or .svg for where tokens lie "
+        "in a target, .json for a finger's way points",
     )
     episodes: int = setting(
         12,
@@ -179,14 +174,13 @@ class PlayConfig(Settings):
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
     target: str | None = setting(
         None,
-        "instead of random targets: a photograph of all tokens of the run, PNG or JPEG, dark on "
-        "light ground or the reverse, at most three touching",
+        "instead of random targets: a puzzle by name, or a file: a puzzle, a drawing, a black "
+        "figure, a photograph of all tokens of which at most three touch; it is told which",
         only={"puzzle": None},
     )
     silhouette: str | None = setting(
         None,
-        "instead of random targets: an outline that tells no pieces, a picture, SVG or JSON, or "
-        "the name of a puzzle of the library; how the run's tokens fill it is searched first",
+        "the same, and its pieces are not told: how the run's tokens fill it is searched first",
         only={"puzzle": None, "target": None},
     )
     solutions: int = setting(
@@ -205,7 +199,7 @@ class PlayConfig(Settings):
         if Path(self.out).suffix not in WRITTEN:
             raise ConfigError(
                 f"out must end with {', '.join(WRITTEN)}, got '{self.out}': .gif and .mp4 move, "
-                ".png shows the ends, .json has a finger's way points"
+                ".png shows the ends, .json and .svg tell where tokens lie"
             )
         if Path(self.out).suffix == ".mp4" and find_spec("av") is None:
             raise ConfigError(
@@ -221,6 +215,11 @@ class PlayConfig(Settings):
         if self.silhouette is not None:
             _refuse(self.changes, (*OF_TARGETS, "starts"), "silhouette", "leave silhouette out")
             _check_kept(self.out, "silhouette", self.silhouette)
+
+    @property
+    def data(self) -> bool:
+        """Whether numbers are asked for, and no picture."""
+        return Path(self.out).suffix in DATA
 
     @property
     def run(self) -> str:

@@ -30,10 +30,9 @@ from tangram_game.scores import (
     of_each,
     of_outlines,
     of_several,
-    score_hidden,
     score_puzzles,
 )
-from tangram_sim.config import SILHOUETTE, SimConfig
+from tangram_sim.config import SimConfig
 from tangram_sim.drawing.game_drawing import figure_sheet
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
@@ -47,7 +46,6 @@ MAX_LINES = 40  # of puzzles and of faults on the screen
 _BESIDE = (
     Score("share_solved_iou", "solved (IoU 0.95)"),
     Score("seconds_per_puzzle", "seconds"),
-    Score("search_seconds", "of them the search"),
     Score("ms_per_choice", "CPU ms for each action", 1),
 )
 
@@ -136,9 +134,8 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     source, names = source_and_names(config.puzzle or ())
     task = run.task
     figures = find_figures(source, task, names, config.turns)
-    hides = task.sim.observe == SILHOUETTE and not task.outlines
-    score = score_hidden if hides else score_puzzles
-    scored = score(task, figures, policies(run, config.rivals), config.seed, run.actor.at_once)
+    players = policies(run, config.rivals)
+    scored = score_puzzles(task, figures, players, config.seed, run.actor.at_once)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(figures)
@@ -191,8 +188,7 @@ def _told(task: Place) -> str:
 def _observed(sim: SimConfig) -> str:
     """What agents see, in words."""
     if sim.looks:
-        pieces = "" if sim.observe == "pictures" else ", pieces hidden"
-        return f"{sim.picture} pictures of {sim.pixels} px{pieces}"
+        return f"{sim.picture} pictures of {sim.pixels} px"
     if sim.observe == "silhouette":
         return "exact outlines, pieces hidden"
     return "exact corners"

@@ -109,7 +109,7 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
     if config.target is not None:
         return photograph_show(run, config, config.target)
     if config.silhouette is not None:
-        given = (config.silhouette, run.task, config.solutions, Path(config.out))
+        given = (config.silhouette, run.task, config.solutions)
         return silhouette_show(run, config, silhouette or read_silhouette(*given))
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.task, play_episodes(run, config), titles, "episode")

@@ -5,21 +5,17 @@ Legend: E puzzles, K tokens, V corners.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Bools, Floats
-from tangram_core.errors import ConfigError
 from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_sim.rewards import scaled_overlap
 from tangram_tasks.metrics import SOLVED, Assembled, assembled, pose_errors, summarise
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
-
-if TYPE_CHECKING:  # needs OpenCV and shapely
-    from tangram_game.figures.hidden import Hidden, Laid
 
 RUN = "this run"
 Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes
@@ -83,85 +79,12 @@ def of_outlines(task: Place, played: Played) -> Scores:
     return _of_areas(found) | {"episodes": float(len(found.iou))} | of_several(played)
 
 
-def _of_areas(found: "Assembled | Laid") -> Scores:
+def _of_areas(found: Assembled) -> Scores:
     """Means of what tells nothing of single pieces."""
     means = {name: float(np.mean(getattr(found, name))) for name in (*_SHARES, *_ACTIONS)}
     reward = float(np.mean(scaled_overlap(found.coverage)))
     solved = float(np.mean(found.iou >= SOLVED))
     return means | {"mean_reward": reward, "share_solved_iou": solved}
-
-
-def score_hidden(
-    task: Place,
-    figures: Sequence[Figure],
-    players: Mapping[str, Player],
-    seed: int,
-    at_once: int = AT_ONCE,
-) -> Scored:
-    """Scores of each policy that lays what was found in the silhouettes.
-
-    Raises:
-        ConfigError: OpenCV or shapely is not installed.
-    """
-    try:
-        # Only here and below: other puzzles need neither.
-        from tangram_game.figures.hidden import hide, play_hidden  # noqa: PLC0415
-        from tangram_game.figures.methods import together  # noqa: PLC0415
-    except ImportError as error:
-        raise _no_library(task, error) from error
-    hidden = hide(task, figures, together(task.layout))
-    laid = {name: play_hidden(hidden, player, seed, at_once) for name, player in players.items()}
-    return _of_hidden({name: (hidden, own) for name, own in laid.items()})
-
-
-def _of_hidden(every: "Mapping[str, tuple[Hidden, Laid]]") -> Scored:
-    """Scores of what each policy laid."""
-    hidden, laid = every[RUN]
-    told = (
-        f"{hidden.filled} of {len(hidden.figures)} filled ({_by(hidden.filled_by)}); any "
-        "dissection counts, so no errors of position and angle, and no pieces under others"
-    )
-    scores = {name: hidden_means(*own) for name, own in every.items()}
-    each = hidden_lines(hidden, laid)
-    return Scored(scores, each, hidden.titles, laid.ends, hidden.goals, told)
-
-
-def hidden_means(hidden: "Hidden", laid: "Laid") -> Scores:
-    """Scores of all puzzles, those that were not filled among them."""
-    return _of_areas(laid) | {
-        "filled": hidden.filled,
-        "filled_by": hidden.filled_by,
-        "not_filled": len(hidden.figures) - hidden.filled,
-        "search_seconds": float(np.mean([search.seconds for search in hidden.searches])),
-        "seconds_per_puzzle": float(np.mean(laid.seconds)),
-    }
-
-
-def hidden_lines(hidden: "Hidden", laid: "Laid") -> list[dict[str, Any]]:
-    """Scores of each puzzle."""
-    return [
-        _line(figure, laid, e, laid.iou >= SOLVED, _ACTIONS)
-        | {
-            "filled": search.filled,
-            "filled_by": search.by if search.filled else "",
-            "search_iou": search.iou,
-            "search_seconds": search.seconds,
-            "seconds": float(laid.seconds[e]),
-        }
-        for e, (figure, search) in enumerate(zip(hidden.figures, hidden.searches, strict=True))
-    ]
-
-
-def _no_library(task: Place, error: ImportError) -> ConfigError:
-    return ConfigError(
-        f"sim.observe={task.sim.observe} needs OpenCV and shapely ({error}): install "
-        "opencv-python-headless and shapely, or set sim.observe=corners"
-    )
-
-
-def _by(counts: Mapping[str, int]) -> str:
-    """Who filled how many, in words."""
-    return ", ".join(f"{count} by the {who}" for who, count in counts.items())
 
 
 def of_each(played: Played) -> Scores:
@@ -196,7 +119,7 @@ def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[
 
 
 def _line(
-    figure: Figure, found: "Assembled | Laid", e: int, solved: Bools, counts: Sequence[str]
+    figure: Figure, found: Assembled, e: int, solved: Bools, counts: Sequence[str]
 ) -> dict[str, Any]:
     """What every list tells of a puzzle; `solved` (E,)."""
     return {

@@ -22,7 +22,6 @@ from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_game.figures.methods import together
 from tangram_game.figures.puzzles import check_inside
-from tangram_game.figures.silhouettes import why_unfilled
 from tangram_sim.drawing.strokes import colour_of
 from tangram_sim.geometry.areas import Area, polygons
 from tangram_sim.geometry.dissections import Dissection
@@ -32,14 +31,12 @@ from tangram_studio.messages import Fill
 from tangram_studio.playing import Sides, player
 from tangram_vision.given.outline_files import FORMAT, VERSION
 from tangram_vision.given.picture_files import READ
-from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
-from tangram_vision.silhouettes.approximations import nearest_figure
+from tangram_vision.given.silhouette_files import Silhouette
 from tangram_vision.silhouettes.silhouettes import Method, silhouette
+from tangram_vision.solving import SECONDS, answer
 
 FILES = (*READ, ".json")
-SECONDS = 5.0  # of a search,
-FREE_SECONDS = 1.0  # where sides are not straight, so that hardly anything fits,
-NEAREST_SECONDS = 2.5  # and of what comes nearest
+FREE_SECONDS = 1.0  # of a search where sides are not straight, so that hardly anything fits
 LAYOUT = "the layout"
 _SHOWN = 480  # pixels along the longer side of what is seen
 _ROUND = 5  # digits of what is sent
@@ -149,22 +146,17 @@ def tans() -> dict[str, object]:
 
 def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
     task = player().run.task
-    layout = task.layout
     seconds = FREE_SECONDS if free else SECONDS
-    drawn = fill_silhouette(name, source, layout, task.tokens.scale, seconds, method=_method(who))
-    first = drawn.filled[0]
-    if first.found is not None and first.solved:
+    found = answer(name, source, task.layout, task.tokens.scale, seconds, method=_method(who))
+    if source == LAYOUT and found.drawn.share is not None:
+        raise ConfigError("the tans lie on each other: move them apart")
+    first = found.drawn.filled[0]
+    how = f"{source[0].upper()}{source[1:]} {found.told.partition(';')[0]}."
+    if found.exact:
         how = f"filled by the {_called(who, first.by)} in {first.seconds:.2f} s"
-        return _answer(drawn, first.found, True, first.iou, how)
-    why = f"{source[0].upper()}{source[1:]} {why_unfilled(drawn, layout)}."
-    if free:
-        why = "Drawn by a free hand."
-    if drawn.share is not None:  # of a known scale, so that it is another figure's
-        lie = "the tans lie on each other: move them apart"
-        raise ConfigError(lie if source == LAYOUT else why.rstrip("."))
-    starts = [one for one in (first.found, first.attempt) if one is not None]
-    found, iou = nearest_figure(drawn.area, layout, NEAREST_SECONDS, starts=starts)
-    return _answer(drawn, found, False, iou, why)
+    elif free:
+        how = "Drawn by a free hand."
+    return _answer(found.drawn, found.ways[0], found.exact, found.iou, how)
 
 
 @lru_cache(maxsize=2)

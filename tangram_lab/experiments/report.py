@@ -165,8 +165,8 @@ def _tests(
         if policy not in (AGENT, "random") and all(levels):
             middle = np.array([one.median for one in levels if one])
             panel.plot(place, middle, "k:", marker=".", alpha=0.6, label=f"{policy} (rival)")
-    for name, levels in figure.reported.items():
-        panel.plot(place, levels, "k--", marker="x", label=name)
+    for name, reported in figure.reported.items():
+        panel.plot(place, reported, "k--", marker="x", label=name)
     texts = [test.replace("_", " ") for test in figure.tests]
     panel.set_xticks(place, texts, rotation=30 if len(texts) > 6 else 0, ha="center")
     panel.set(ylabel=LABELS[figure.measure])

@@ -1,8 +1,7 @@
 """A silhouette from a file or by name -> where a layout's tokens lie that fill it.
 
 A file is a picture of it, dark on light or the reverse, or tells its outline. Its place and its
-angle are free, and so is its scale: the area tells it, and must be the tokens' where the file tells
-it, too.
+angle are free, and so is its scale: the area tells it, also where a file tells another.
 
 Legend: H x W pixels of a picture.
 """
@@ -31,7 +30,6 @@ from tangram_vision.silhouettes.silhouettes import (
     UNLEARNED,
     Filled,
     Method,
-    attempt_outline,
     fill_outline,
 )
 from tangram_vision.silhouettes.tilts import mapped, shift
@@ -104,16 +102,13 @@ def fill_silhouette(
 def _from_outline(
     drawn: Drawn, layout: Layout, scale: float, seconds: float, count: int, method: Method
 ) -> Silhouette:
-    """Scaled to the tokens' area, unless it tells another scale, filled, and drawn."""
+    """Scaled to the tokens' area, filled, and drawn."""
     area, total = drawn.area, float(layout.areas.sum())
     own = float(np.sqrt(total / area.area))
     share = None if drawn.side is None else float(area.area * (scale / drawn.side) ** 2 / total)
     wrong = share is not None and abs(share - 1.0) > _OFF
-    if wrong and drawn.side is not None:
-        own = scale / drawn.side
     placed, size, unit = _framed(area, own)
-    filled = attempt_outline(placed, layout, seconds) if wrong else None
-    every = (filled,) if filled else tuple(fill_outline(placed, layout, seconds, count, method))
+    every = tuple(fill_outline(placed, layout, seconds, count, method))
     mask = _mask(placed, size, unit)
     drawing = np.diag([unit, -unit, 1.0])
     return Silhouette(_inked(mask), mask, every, drawing, placed, share if wrong else None)

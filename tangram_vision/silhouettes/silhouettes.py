@@ -157,14 +157,6 @@ def fill_outline(
     return [Filled(None, iou, passed, loose.taken, False, nearest)]
 
 
-def attempt_outline(area: Area, layout: Layout, seconds: float) -> Filled:
-    """The tokens that could be laid in an outline whose area is not theirs."""
-    begin = time.thread_time()
-    budget = Budget(begin + seconds)
-    laid, iou = nearest_fill(area, layout, budget, (), UNLEARNED)
-    return Filled(None, iou, time.thread_time() - begin, budget.taken, False, laid)
-
-
 def nearest_fill(
     area: Area, layout: Layout, budget: Budget, tried: Sequence[list[Laid]], method: Method
 ) -> tuple[Dissection | None, float]:

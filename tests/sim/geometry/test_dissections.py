@@ -17,12 +17,10 @@ from tangram_sim.targets.connected import sample_connected
 from tangram_vision.silhouettes.silhouettes import (
     UNLEARNED,
     _alike,
-    attempt_outline,
     covered,
     fill_outline,
     nearest_fill,
     overlap,
-    pieces,
 )
 from tests.sim.builders import SEVEN, layout_of
 
@@ -214,14 +212,6 @@ def test_tokens_that_lie_on_each_other_are_no_better_attempt() -> None:
     both, more = nearest_fill(side, LAYOUT, Budget(0.0), [two], UNLEARNED)
     assert both is not None
     assert more > 0.26
-
-
-def test_an_attempt_says_what_was_laid() -> None:
-    filled = attempt_outline(polygon(np.array([0.0, 1.0, 1.0 + 0.83j, 0.83j])), LAYOUT, 30.0)
-    assert filled.attempt is not None
-    assert 4 <= len(pieces(LAYOUT, filled.attempt)) < 7
-    assert filled.iou > 0.8
-    assert not filled.solved
 
 
 def test_dissections_that_look_alike_are_one() -> None:

@@ -1,0 +1,106 @@
+"""A figure, of a file or of the library -> tokens that fill it; else those that come nearest."""
+
+import time
+from dataclasses import dataclass
+
+from tangram_core.run.outcome import plural
+from tangram_sim.geometry.dissections import Dissection
+from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
+from tangram_sim.puzzles.assembly import COUNTS
+from tangram_sim.targets.targets import has_all_tans
+from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
+from tangram_vision.silhouettes.approximations import nearest_figure
+from tangram_vision.silhouettes.silhouettes import UNLEARNED, Method
+from tangram_vision.solution import Picture, Solution, tokens_of
+
+SECONDS = 5.0  # of a search, and
+NEAREST_SECONDS = 2.5  # of what comes nearest
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """How tokens make a figure.
+
+    Attributes:
+        drawn: what was shown.
+        ways: how they fill it, in different ways; or the one that comes nearest.
+        exact: whether they fill it.
+        iou: area that figure and tokens share over the area of both together, of the first way.
+        told: how it was filled, or why not, in words.
+        seconds: of processor time that it took.
+    """
+
+    drawn: Silhouette
+    ways: tuple[Dissection, ...]
+    exact: bool
+    iou: float
+    told: str
+    seconds: float
+
+    def solution(self, layout: Layout, scale: float, source: str) -> Solution:
+        """The first way as data; the side of the full square is in units of the layout."""
+        lies = self.ways[0]
+        return Solution(
+            source=source,
+            kind="filled" if self.exact else "nearest",
+            told=self.told,
+            iou=round(self.iou, 6),
+            seconds=round(self.seconds, 3),
+            picture=Picture(*self.drawn.picture.size),
+            tokens=tokens_of(layout, scale, lies, self.drawn.corners(layout, lies)),
+        )
+
+
+def solve(path: str, seconds: float = SECONDS) -> Solution:
+    """Where the seven tans lie in a figure; see `tangram_vision.solve`."""
+    shapes = tuple(name for name, count in COUNTS.items() for _ in range(count))
+    layout = make_layout(TokensConfig(shapes, 1.0))
+    return answer(path, path, layout, 1.0, seconds).solution(layout, 1.0, path)
+
+
+def answer(
+    name: str,
+    source: str,
+    layout: Layout,
+    scale: float,
+    seconds: float = SECONDS,
+    count: int = 1,
+    method: Method = UNLEARNED,
+) -> Answer:
+    """Fill a figure, or come near to it with all tokens; see `fill_silhouette`.
+
+    Raises:
+        ConfigError: a file that cannot be used.
+    """
+    begin = time.thread_time()
+    drawn = fill_silhouette(name, source, layout, scale, seconds, count, method)
+    first, ways = drawn.filled[0], [one.found for one in drawn.filled if one.solved]
+    laid = tuple(one for one in ways if one is not None)
+    if laid:
+        told = _filled(drawn, seconds, count)
+        return Answer(drawn, laid, True, first.iou, told, time.thread_time() - begin)
+    starts = [one for one in (first.found, first.attempt) if one is not None]
+    found, iou = nearest_figure(drawn.area, layout, NEAREST_SECONDS, starts=starts)
+    told = f"{_unfilled(drawn, layout)}; the nearest figure has IoU {iou:.3f} with it"
+    return Answer(drawn, (found,), False, float(iou), told, time.thread_time() - begin)
+
+
+def _filled(drawn: Silhouette, seconds: float, count: int) -> str:
+    first, found = drawn.filled[0], len(drawn.filled)
+    if count == 1:
+        return f"filled by the {first.by} in {first.seconds:.2f} s, IoU {first.iou:.3f}"
+    others = ", all that there are" if first.complete else ""
+    more = "" if found == count or first.complete else f", no more in {seconds:g} s"
+    return f"{plural(found, 'dissection')}{others}{more}"
+
+
+def _unfilled(drawn: Silhouette, layout: Layout) -> str:
+    (filled,) = drawn.filled
+    names = ", ".join(shape.name for shape in layout.shapes)
+    tokens = "the seven tans" if has_all_tans(layout) else names
+    if drawn.share is not None:
+        share = f"{drawn.share:.2f}" if 0.01 <= drawn.share < 100.0 else f"{drawn.share:.2g}"
+        return f"by its side it covers {share} of {tokens}, and as large as they are none fill it"
+    if filled.complete:
+        return f"cannot be filled with {tokens}: all ways were tried, {filled.nodes} steps"
+    return f"was not filled with {tokens} in {filled.seconds:.1f} s"
