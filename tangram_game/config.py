@@ -159,7 +159,7 @@ class PlayConfig(Settings):
         None, "folder of the run, or an agent that comes with tangram-rl: pretrained/square"
     )
     out: str = setting(
-        "play.gif",
+        "runs/play.gif",
         ".gif or .mp4 for an animation, .png for one picture; .json or .svg for where tokens lie "
         "in a target, .json for a finger's way points",
     )
@@ -203,8 +203,7 @@ class PlayConfig(Settings):
             )
         if Path(self.out).suffix == ".mp4" and find_spec("av") is None:
             raise ConfigError(
-                f"out={self.out} needs PyAV, which is missing: pip install 'tangram-rl[video]', or "
-                "write a .gif"
+                f"out={self.out} needs PyAV, which is missing: pip install av, or write a .gif"
             )
         super().__post_init__()
         if self.puzzle is not None:

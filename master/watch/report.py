@@ -130,7 +130,8 @@ def activity(trainer: Trainer, players: int) -> str:
     """What happens, or what is waited for."""
     limiter, starts = trainer.rate_limiter, trainer.pace.learning_starts
     if limiter.may_update():
-        return "learning, workers wait" if players and not limiter.may_insert() else "learning"
+        faster = players and not limiter.may_insert()
+        return "learning, faster workers wait" if faster else "learning"
     if not players:
         return "waiting for workers to join"
     if trainer.episodes and not limiter.transitions:

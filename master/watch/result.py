@@ -87,7 +87,7 @@ def show_result(
     run = {"run_dir": folder.path}
     if folder.picture.exists():  # so it can be drawn
         paths.insert(1, ("picture", str(folder.picture)))
-        watch = command_line("tangram-play", {**run, "out": "play.gif", **code})
+        watch = command_line("tangram-play", {**run, "out": folder.path / "play.gif", **code})
         paths.append(("watch it play", watch))
     else:
         paths.append(("score it", command_line("tangram-eval", {**run, **code})))

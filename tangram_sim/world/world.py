@@ -84,7 +84,7 @@ def check_shown(sim: SimConfig, outlines: bool) -> None:
     if sim.observe == "silhouette" and not outlines:
         raise ConfigError(
             "sim.observe=silhouette is for an agent of outlines: train one with task=fill "
-            "agent=outline, or set sim.observe=corners; tangram-play silhouette= fills one by a search"
+            "agent=outline, or set sim.observe=corners; tangram-play silhouette= fills one"
         )
 
 

@@ -74,7 +74,7 @@ class Judge:
             why = f"{type(error).__name__}: {error}".strip().splitlines()[0]
             raise ConfigError(
                 f"task.id={self._config.id} cannot be made ({why}): install what it needs, for "
-                "Fetch and Panda: pip install 'tangram-rl[robotics]'"
+                "Fetch and Panda: pip install gymnasium-robotics 'mujoco<3.12' panda-gym"
             ) from error
 
     def scaled(self, actions: Singles) -> Singles:
@@ -139,7 +139,8 @@ class Judge:
             except Exception as error:  # whatever its code raises
                 raise ConfigError(
                     f"task.imports: cannot import {module} ({error}): install its package, for "
-                    "gymnasium_robotics and panda_gym: pip install 'tangram-rl[robotics]'"
+                    "gymnasium_robotics and panda_gym: pip install gymnasium-robotics "
+                    "'mujoco<3.12' panda-gym"
                 ) from error
         try:
             horizon = gymnasium.spec(config.id).max_episode_steps

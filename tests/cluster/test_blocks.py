@@ -1,5 +1,6 @@
 """Blocks of README and docs, pasted as they stand; every block says whether it runs."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,20 @@ def test_it_runs_without_a_warning(
     if "model" in names:
         assert names["model"]._n_updates > 100
     assert {*folder.iterdir()} == before
+
+
+def test_commands_mean_the_same_to_bash_and_to_zsh() -> None:
+    """Zsh looks for files where brackets are bare, and a # that is typed is a word to it."""
+    quoted = re.compile(r"'[^']*'|\"[^\"]*\"")
+    special = re.compile(r"[\[\]*?^!#]|\{.*\}|(?<!\S)=")
+    bare = [
+        f"{block.name}: {line}"
+        for block in all_blocks()
+        if block.language == "bash"
+        for line in block.code.splitlines()
+        if special.search(quoted.sub("", line))
+    ]
+    assert bare == []
 
 
 def test_every_block_says_what_becomes_of_it() -> None:

@@ -229,11 +229,11 @@ def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
         assert (status, reason in err) == (2, True), err
 
 
-def test_a_task_without_a_plan_writes_none(tmp_path: Path) -> None:
+def test_without_a_figure_a_task_without_a_plan_writes_none(tmp_path: Path) -> None:
     told = ("run_dir=pretrained/square", f"out={tmp_path / 'x.json'}")
     status, _, err = here("tangram-play", *told, cwd=tmp_path)
     assert (status, list(tmp_path.iterdir())) == (2, [])
-    assert "task=place makes no plan: set out=play.gif" in err
+    assert "x.json is for where tokens lie in a figure, or a finger's way: add target=cat" in err
 
 
 def test_an_arm_that_never_pushed_is_filmed_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:

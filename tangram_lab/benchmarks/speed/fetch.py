@@ -77,8 +77,7 @@ def label() -> str:
         return f"Stable-Baselines3 {version('stable-baselines3')}"
     except PackageNotFoundError:
         raise ModuleNotFoundError(
-            "Stable-Baselines3, which this compares with, is missing: "
-            "pip install 'tangram-rl[peers]'"
+            "Stable-Baselines3, which this compares with, is missing: pip install stable-baselines3"
         ) from None
 
 
@@ -97,7 +96,7 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
     for module in {match.module for match in matches}:
         if find_spec(module) is None:
             raise ModuleNotFoundError(
-                f"{module} is missing: pip install 'tangram-rl[robotics]', or name an id= without"
+                f"{module} is missing: pip install gymnasium-robotics 'mujoco<3.12' panda-gym"
             )
     for match in matches:
         key = asdict(match)

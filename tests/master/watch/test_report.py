@@ -81,7 +81,7 @@ def test_what_could_be_played_is_that_of_those_who_told_for_all() -> None:
     [
         (0, 0, 0, "waiting for workers to join"),
         (3, 0, 1, "filling the replay, 3 of 4"),
-        (4, 0, 1, "learning, workers wait"),
+        (4, 0, 1, "learning, faster workers wait"),
         (4, 0, 0, "learning"),
         (4, 1, 1, "learning"),
         (4, 2, 1, "waiting for episodes"),
@@ -108,7 +108,7 @@ def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
     said = f"waiting for an episode to learn from: {MADE.task.waits}"
     assert made.reporter.flush(0).texts["activity"] == said
     made.guard.trainer.insert(episodes)
-    assert made.reporter.flush(0).texts["activity"] == "learning, workers wait"
+    assert made.reporter.flush(0).texts["activity"] == "learning, faster workers wait"
 
 
 def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores(

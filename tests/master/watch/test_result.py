@@ -61,7 +61,7 @@ def test_the_final_table(
     folder.path.mkdir()
     folder.picture.touch()
     show_result(shown, folder, RESULT | change, {})
-    assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)
+    assert f"tangram-play run_dir={folder.path} out={folder.path}/play.gif" in text(shown)
     assert "test_episodes.png" in text(shown)
 
 
