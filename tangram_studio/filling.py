@@ -33,10 +33,13 @@ from tangram_vision.given.outline_files import FORMAT, VERSION
 from tangram_vision.given.picture_files import READ
 from tangram_vision.given.silhouette_files import Silhouette
 from tangram_vision.silhouettes.silhouettes import Method, silhouette
+from tangram_vision.solution import Solution
 from tangram_vision.solving import SECONDS, answer
+from tangram_vision.solving import Answer as Answered
 
 FILES = (*READ, ".json")
 FREE_SECONDS = 1.0  # of a search where sides are not straight, so that hardly anything fits
+HEAPS = 3  # parts of a figure that is laid, at most
 LAYOUT = "the layout"
 _SHOWN = 480  # pixels along the longer side of what is seen
 _ROUND = 5  # digits of what is sent
@@ -56,6 +59,7 @@ class Answer:
         pieces: K outlines of (V, 2), pixels of that picture, y down.
         outline: N rings of (M, 2) of the silhouette in the arena.
         laid: N rings of what the tokens cover.
+        solution: where the tokens lie in what was given, as data.
     """
 
     goal: Sides
@@ -67,6 +71,7 @@ class Answer:
     pieces: list[list[list[float]]]
     outline: list[list[list[float]]]
     laid: list[list[list[float]]]
+    solution: Solution
 
 
 def fill(asked: Fill) -> Answer:
@@ -85,6 +90,9 @@ def fill(asked: Fill) -> Answer:
     if asked.pieces is not None:
         poses, flipped = asked.pieces.sides
         corners = layout.corners(poses, flipped)
+        heaps = len(shapely.get_parts(silhouette(layout, Dissection(poses, flipped))))
+        if heaps > HEAPS:
+            raise ConfigError(f"the tans lie in {heaps} heaps: push them together until they touch")
         every = [corners[layout.corners_of(k)].tolist() for k in range(layout.tokens)]
         content |= {"outlines": every, "side": scale}
     with TemporaryDirectory(prefix="tangram-studio-") as folder:
@@ -156,7 +164,8 @@ def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
         how = f"filled by the {_called(who, first.by)} in {first.seconds:.2f} s"
     elif free:
         how = "Drawn by a free hand."
-    return _answer(found.drawn, found.ways[0], found.exact, found.iou, how)
+    solution = found.solution(task.layout, task.tokens.scale, source.removeprefix("the "))
+    return _answer(found, how, solution)
 
 
 @lru_cache(maxsize=2)
@@ -169,8 +178,8 @@ def _called(who: str, by: str) -> str:
     return "agent alone" if who == "agent" else {"beam": "agent, looking ahead"}.get(by, by)
 
 
-def _answer(drawn: Silhouette, found: Dissection, exact: bool, iou: float, how: str) -> Answer:
-    task = player().run.task
+def _answer(answered: Answered, how: str, solution: Solution) -> Answer:
+    task, drawn, found = player().run.task, answered.drawn, answered.ways[0]
     layout = task.layout
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
     check_inside("the figure", task, layout.corners(poses, found.flipped), "draw it less long")
@@ -183,7 +192,8 @@ def _answer(drawn: Silhouette, found: Dissection, exact: bool, iou: float, how: 
     width, height = (round(side * share) for side in drawn.picture.size)
     laid = silhouette(layout, Dissection(poses, found.flipped))
     rings = _rings(area), _rings(laid)
-    return Answer(goal, exact, float(iou), how, seen, (width, height), pieces, *rings)
+    exact, iou, size = answered.exact, answered.iou, (width, height)
+    return Answer(goal, exact, iou, how, seen, size, pieces, *rings, solution)
 
 
 def _seen(drawn: Silhouette) -> tuple[str, float]:

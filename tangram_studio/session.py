@@ -8,6 +8,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from tangram_core.errors import TangramError
 from tangram_studio import filling, playing, saving
 from tangram_studio.filling import Answer
@@ -212,4 +214,5 @@ def _saved(asked: Save, moves: list[Move], goal: Sides | None) -> bytes:
 def plain(answer: Answer) -> dict[str, Any]:
     """How a silhouette is filled, as a page is told."""
     goal = {"poses": answer.goal.poses.round(6).tolist(), "flipped": answer.goal.flipped.tolist()}
-    return vars(answer) | {"goal": goal}
+    solution = msgspec.to_builtins(answer.solution)
+    return vars(answer) | {"goal": goal, "solution": solution}

@@ -2,6 +2,7 @@
 
 import { Board, make, pathOf, tray } from "./board.js";
 import { Pen } from "./draw.js";
+import { Solving } from "./solve.js";
 
 const $ = (id) => document.getElementById(id);
 const LIMIT = 10e6; // bytes of a file
@@ -22,6 +23,11 @@ class Studio {
     this.over = true;
     this.name = "figure";
     this.board.onDrag = (done, byKey) => this.dragged(done, byKey);
+    this.solving = new Solving(this.board, {
+      say: (text, numbers) => this.say(text, false, numbers),
+      reveal: (k) => { $("seen-pieces").children[k].style.display = ""; },
+      next: () => this.send({ ask: "next" }),
+    });
     this.begun = 0; // moves of this figure that were shown, or begun to be
     this.board.onMove = (move) => {
       this.begun += move.token !== null;
@@ -103,17 +109,20 @@ class Studio {
     else if (message.told === "filled") this.filled(message);
     else if (message.told === "move") this.moved(message);
     else if (message.told === "wait") {
-      this.say(`Others are served first: ${message.ahead} before you. It goes on by itself.`);
+      this.say("The studio is busy; it goes on by itself.", false, `${message.ahead} before this one`);
     } else if (message.told === "refused") this.refused(message.why);
   }
 
-  say(text, bad = false) {
+  say(text, bad = false, numbers = "") {
     $("status").textContent = text;
     $("status").classList.toggle("bad", bad);
+    $("numbers").hidden = !numbers;
+    $("numbers").lastElementChild.textContent = numbers;
   }
 
   refused(why) {
     this.board.halt();
+    if (this.looking) this.clear(); // what was answered before is not the answer to this
     this.looking = false;
     this.over = true;
     this.say(`That did not work: ${why}`, true);
@@ -143,14 +152,17 @@ class Studio {
 
   source(kind) {
     this.kind = kind;
-    for (const panel of document.querySelectorAll("[data-source]")) panel.hidden = panel.dataset.source !== kind;
+    for (const panel of document.querySelectorAll("[data-source]")) {
+      panel.hidden = !panel.dataset.source.split(" ").includes(kind);
+    }
     const hint = {
       library: "Choose a figure: the agent lays it.",
+      solve: "Choose a figure, and lay it yourself.",
       lay: "Lay a figure of the seven tans, then show it to the agent.",
       draw: "Draw a figure on the table; when it is closed, the agent begins.",
       file: "Drop a picture on the table.",
     }[kind];
-    const mine = kind === "lay" || kind === "draw"; // the table is the person's
+    const mine = kind !== "library" && kind !== "file"; // the table is the person's
     if (!mine && this.board.mode === "play") {
       if (this.over) this.say(hint); // what is being laid goes on
       return;
@@ -158,15 +170,22 @@ class Studio {
     clearTimeout(this.timer);
     this.looking = false;
     this.over = true;
-    this.goal = null;
     this.number += 1;
     this.board.halt();
-    this.board.show([]);
+    this.clear();
     this.board.put(tray(this.board.tokens));
-    $("answer").hidden = true;
-    this.table(mine ? kind : "play");
+    this.table(kind === "solve" ? "lay" : mine ? kind : "play");
     this.say(hint);
     if (mine) $("board").scrollIntoView({ block: "nearest" });
+  }
+
+  // No figure is on the table.
+  clear() {
+    this.goal = null;
+    this.solving.answer = null;
+    this.board.holds = [];
+    this.board.show([]);
+    $("answer").hidden = true;
   }
 
   // What a hand on the table does.
@@ -242,20 +261,34 @@ class Studio {
     this.goal = answer.goal;
     this.exact = answer.exact;
     this.iou = answer.iou;
-    $("answer").hidden = false;
+    this.answer = answer;
+    $("answer").hidden = this.kind === "solve";
     $("seen-picture").src = answer.seen;
     const [width, height] = answer.size;
     $("seen-pieces").setAttribute("viewBox", `0 0 ${width} ${height}`);
     $("seen-pieces").replaceChildren(...answer.pieces.map((piece, k) => make("polygon", {
       points: piece.map((point) => point.join(",")).join(" "), fill: this.board.tokens[k].colour,
     })));
-    const share = `shares ${per_cent(answer.iou)} with it (IoU, the shared area over that of both together)`;
+    const share = `It shares ${per_cent(answer.iou)} of its area with what you showed, the red dashes.`;
     $("told").textContent = answer.exact
-      ? `What it sees, and how it will lay it; equal tans may swap. It was ${answer.how}, IoU ${answer.iou.toFixed(3)}.`
-      : `Seven tans do not fill it. The nearest figure that was found ${share}; red dashes are what was shown. ${answer.how}`;
+      ? `What it sees, and where the tans go: ${answer.how}.`
+      : `Seven tans do not fill it; this is the nearest figure that was found. ${share} ${answer.how}`;
+    if (this.kind === "solve") {
+      this.solving.begin(answer);
+      return;
+    }
     this.table("play");
     this.board.show(answer.laid, answer.exact ? [] : answer.outline);
     this.play(null);
+  }
+
+  race() {
+    if (!this.solving.race()) return;
+    for (const piece of $("seen-pieces").children) piece.style.display = "none";
+    $("told").textContent = "How far the agent is.";
+    $("answer").hidden = false;
+    this.number += 1;
+    this.send({ ask: "play", number: this.number, goal: this.goal, start: null, shown: 0, motion: "lift" });
   }
 
   play(start) {
@@ -273,6 +306,10 @@ class Studio {
   }
 
   moved(move) {
+    if (this.kind === "solve") {
+      this.solving.raced(move);
+      return;
+    }
     this.asking = false;
     this.over = move.over;
     this.board.add(move);
@@ -287,6 +324,7 @@ class Studio {
   }
 
   dragged(done, byKey = false) {
+    if (this.kind === "solve" && done) this.solving.look();
     if (this.board.mode !== "play") return;
     clearTimeout(this.timer);
     this.board.halt();
@@ -300,10 +338,11 @@ class Studio {
   shown(move) {
     const so_far = `covers ${per_cent(move.coverage)}, IoU ${move.iou.toFixed(3)}`;
     if (!move.over) {
-      this.say(move.blocked ? `Others are in the way: it tries another tan. It ${so_far}.` : `It ${so_far}.`);
+      const told = move.blocked ? "Others are in the way: it tries another tan." : "The agent lays it.";
+      this.say(told, false, `It ${so_far}.`);
     } else if (move.iou >= 0.95) {
-      this.say(this.exact ? `Laid: ${so_far}.` : `Laid: covers ${per_cent(move.coverage)} of the nearest figure.`);
-    } else this.say(`It can do no more: ${so_far} of the figure.`);
+      this.say(this.exact ? "Solved!" : "Laid: the nearest figure of seven tans.", false, `It ${so_far}.`);
+    } else this.say("It can do no more.", false, `It ${so_far} of the figure.`);
   }
 
   // Files
@@ -313,6 +352,12 @@ class Studio {
     this.say("The file is made …");
     const tokens = kind === "json" ? this.goal : this.board.scene;
     this.send({ ask: "save", kind, tokens, name: this.name, shown: this.begun });
+  }
+
+  // Where each tan lies, as it came with the answer.
+  solution() {
+    this.saving = { kind: "solution.json", type: "application/json", name: this.name };
+    this.file(new TextEncoder().encode(JSON.stringify(this.answer.solution, null, 1)));
   }
 
   file(data) {
@@ -331,7 +376,7 @@ class Studio {
     }
     const pens = {
       polygon: "Click corner after corner, then the first again. By keyboard: Tab to the table, arrow keys, Space sets a corner, Enter closes.",
-      free: "Draw around the figure in one stroke. Wobbly lines are no harm; the nearest figure of tans is looked for.",
+      free: "Draw around the figure in one stroke. Lines need not be straight: the nearest figure of tans is found.",
     };
     for (const one of document.querySelectorAll("[name=pen]")) {
       one.addEventListener("change", () => {
@@ -346,7 +391,13 @@ class Studio {
     $("draw-undo").addEventListener("click", () => this.pen.undo());
     $("draw-clear").addEventListener("click", () => this.source("draw"));
     $("draw-done").addEventListener("click", () => this.fillDrawing());
-    $("lay-clear").addEventListener("click", () => this.source("lay"));
+    $("lay-clear").addEventListener("click", () => {
+      if (this.kind === "solve" && this.solving.answer) this.solving.begin(this.answer);
+      else this.source(this.kind);
+    });
+    $("hint").addEventListener("click", () => this.solving.hint());
+    $("race").addEventListener("click", () => this.race());
+    $("save-solution").addEventListener("click", () => this.solution());
     $("lay-done").addEventListener("click", () => {
       this.name = "layout";
       this.fill({ pieces: this.board.scene });

@@ -2,7 +2,7 @@
 // Lengths are in arena units, y up; angles in radians.
 
 const SVG = "http://www.w3.org/2000/svg";
-const MOVE_MS = 1000;
+export const MOVE_MS = 1000;
 const LARGER = 0.12; // how much larger a carried tan looks
 const STEP = 0.05;
 const TURN = Math.PI / 4;
@@ -25,6 +25,7 @@ export class Board {
     this.svg = svg;
     this.tokens = tokens;
     this.mode = "play"; // or lay, draw
+    this.holds = []; // polygons beside the tans that a tan snaps to
     this.queue = [];
     this.move = null;
     this.ms = MOVE_MS; // that a move takes
@@ -255,10 +256,9 @@ export class Board {
       const way = Math.hypot(dx, dy);
       if (way < reach && (!best || way + cost < best.cost)) best = { dx, dy, cost: way + cost };
     };
-    for (let other = 0; other < this.tans.length; other += 1) {
-      if (other === k) continue;
-      const theirs = this.corners(other);
-      const mine = this.corners(k);
+    const others = this.tans.map((_, other) => other).filter((other) => other !== k);
+    const mine = this.corners(k);
+    for (const theirs of [...others.map((other) => this.corners(other)), ...this.holds]) {
       for (const [ps, qs, sign] of [[mine, theirs, 1], [theirs, mine, -1]]) {
         for (const [px, py] of ps) {
           qs.forEach(([qx, qy], i) => {

@@ -1,0 +1,106 @@
+// A person lays a figure: a clock runs, a hint lays one tan, and the agent may race.
+
+import { MOVE_MS, pathOf, tray } from "./board.js";
+
+const PIXELS = 240; // along the table, in which figure and tans are compared
+const SOLVED = 0.95; // of the area of both together, as everywhere
+const NEAR = 0.03; // a tan this near to where the answer has it lies there
+const OVER = 0.03; // of the tans' area that may lie on other tans
+
+const clock = (ms) => `${Math.floor(ms / 60_000)}:${String(Math.floor(ms / 1000) % 60).padStart(2, "0")}`;
+
+export class Solving {
+  // `say` tells a line, `reveal(k)` shows where the answer has a tan, `next` asks for the agent's next move.
+  constructor(board, { say, reveal, next }) {
+    Object.assign(this, { board, say, reveal, next, solved: false, racing: false });
+    this.canvas = new OffscreenCanvas(PIXELS, PIXELS);
+  }
+
+  begin(answer) {
+    this.answer = answer;
+    this.racing = false;
+    this.board.holds = answer.laid;
+    this.board.show(answer.laid);
+    this.again();
+  }
+
+  again() {
+    this.solved = false;
+    this.begun = performance.now();
+    this.board.put(tray(this.board.tokens));
+    this.say("Drag the tans onto the figure. R turns a tan, F turns the parallelogram over.");
+  }
+
+  // What was laid so far; a person has let go of a tan.
+  look() {
+    if (!this.answer || this.solved) return;
+    const { iou, twice } = this.compared();
+    if (iou >= SOLVED && twice <= OVER) {
+      this.solved = true;
+      this.took = performance.now() - this.begun;
+      const first = this.racing ? " You were faster than the agent." : "";
+      this.say(`Solved! It took you ${clock(this.took)}.${first}`, `IoU ${iou.toFixed(3)}`);
+    }
+  }
+
+  // One tan that does not lie as the answer has it is laid there.
+  hint() {
+    if (!this.answer || this.solved) return;
+    const { poses, flipped } = this.answer.goal;
+    const away = poses.map(([x, y], k) => Math.hypot(x - this.board.poses[k][0], y - this.board.poses[k][1]));
+    const k = away.findIndex((way, i) => way > NEAR && !this.taken(i));
+    if (k < 0) return;
+    this.board.poses[k] = [...poses[k]];
+    this.board.flipped[k] = flipped[k];
+    this.board.raise(k);
+    this.board.draw();
+    this.say(`The ${this.board.tokens[k].name.replaceAll("_", " ")} is laid.`);
+    this.look();
+  }
+
+  // Whether another tan of the shape lies in a tan's place already.
+  taken(k) {
+    const [x, y] = this.answer.goal.poses[k];
+    return this.board.tokens.some((token, other) => token.name === this.board.tokens[k].name
+      && Math.hypot(this.board.poses[other][0] - x, this.board.poses[other][1] - y) <= NEAR);
+  }
+
+  race() {
+    if (!this.answer) return false;
+    this.again();
+    this.racing = true;
+    this.say("The agent has begun, in the small picture.");
+    return true;
+  }
+
+  // A move of the agent in a race: it takes as long as on the table.
+  raced(move) {
+    const own = this.begun;
+    setTimeout(() => {
+      if (this.begun !== own || !this.racing) return;
+      if (move.token !== null) this.reveal(move.token);
+      if (!move.over) this.next();
+      else if (!this.solved) {
+        this.racing = false;
+        this.say(`The agent was first, in ${clock(performance.now() - this.begun)}. Go on, or start again.`);
+      }
+    }, move.token === null ? 0 : MOVE_MS);
+  }
+
+  // Shared area over that of both, and the share of the tans that lies on others.
+  compared() {
+    const draw = (paths) => {
+      const context = this.canvas.getContext("2d", { willReadFrequently: true });
+      context.setTransform(PIXELS / 2, 0, 0, -PIXELS / 2, PIXELS / 2, PIXELS / 2);
+      context.clearRect(-1, -1, 2, 2);
+      for (const path of paths) context.fill(new Path2D(path), "evenodd");
+      return context.getImageData(0, 0, PIXELS, PIXELS).data.filter((_, i) => i % 4 === 3).map((a) => a > 127);
+    };
+    const every = this.board.tokens.map((_, k) => pathOf([this.board.corners(k)]));
+    const [figure, tans] = [draw([pathOf(this.answer.laid)]), draw(every)];
+    const count = (pixels) => pixels.reduce((sum, one) => sum + one, 0);
+    const shared = figure.filter((one, i) => one && tans[i]).length;
+    const alone = every.reduce((sum, path) => sum + count(draw([path])), 0);
+    return { iou: shared / (count(figure) + count(tans) - shared), twice: 1 - count(tans) / alone };
+  }
+}
