@@ -246,8 +246,7 @@ those that come with tangram-rl or your own, see docs/puzzles.md.""",
         (
             "tangram-eval run_dir=runs/my_run episodes=1000 out=scores.json",
             "tangram-eval run_dir=runs/my_run sim.actions_per_token=3 sim.backend=kinematic",
-            "tangram-eval run_dir=runs/my_game puzzle=test turns=8 out=puzzles.json "
-            "sheet=puzzles.png",
+            "tangram-eval run_dir=runs/my_game puzzle=test turns=8 out=puzzles.json ",
         ),
         ("tangram_game.config:EvalConfig",),
         over=OVER,

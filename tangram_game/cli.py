@@ -32,9 +32,8 @@ def _evaluate(settings: Plain) -> int:
 
     paths = _with_figures(with_changes(with_absolute_paths(settings)))
     config = from_mapping(EvalConfig, paths)
-    for name, path in (("out", config.out), ("sheet", config.sheet)):
-        if path is not None:
-            check_writable(name, Path(path))
+    if config.out is not None:
+        check_writable("out", Path(config.out))
     _check_played(config)
     tell(f"loads and plays {config.run}")
 
@@ -63,7 +62,7 @@ def _play(settings: Plain) -> int:
     if config.silhouette is not None:
         from tangram_game.figures.silhouettes import read_silhouette
 
-        filled = read_silhouette(config.silhouette, stored.task, config.solutions)
+        filled = read_silhouette(config.silhouette, stored.task)
     tell(f"loads and plays {config.run}")
     from tangram_game.play import play_run
 
@@ -134,10 +133,10 @@ def _with_figures(settings: Plain) -> Plain:
     run = settings["run_dir"] or game_run()
     if not isinstance(read_changed(run, changes).setup.task, Push):
         return settings
-    if settings.get("sheet") or settings["turns"] != 1 or Path(puzzle[0]).suffix:
+    if settings["turns"] != 1 or Path(puzzle[0]).suffix:
         raise ConfigError(
             "task=push makes figures of the library, at an angle of each episode: give names "
-            "alone, as in puzzle=cat or [cat,dog], without turns, sheet or file"
+            "alone, as in puzzle=cat or [cat,dog], without turns or file"
         )
     own = changes.get("task", {})
     if "puzzle" in own:
@@ -186,7 +185,7 @@ def with_absolute_paths(settings: Plain) -> Plain:
     from tangram_sim.puzzles.figures import SPLITS
 
     result = dict(settings)
-    for name in ("run_dir", "out", "sheet"):
+    for name in ("run_dir", "out"):
         result[name] = _absolute(result.get(name), is_run=name == "run_dir")
     for name in ("target", "silhouette"):
         value = result.get(name)

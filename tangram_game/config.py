@@ -17,7 +17,6 @@ OF_TARGETS = ("targets", "mirrored")  # settings of sim that say nothing of a pu
 MAX_EPISODES = 1_000_000
 MAX_SHOWN = 100
 MAX_TURNS = 360
-MAX_SOLUTIONS = 20
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
 ALL = ("all",)
 PICTURES = (".gif", ".mp4", ".png")
@@ -91,9 +90,6 @@ class EvalConfig(Settings):
     out: str | None = setting(None, "JSON file for the scores; they are printed anyway")
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
-    sheet: str | None = setting(
-        None, "PNG file, a picture of every puzzle's end", unless={"puzzle": None}
-    )
     changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -103,8 +99,6 @@ class EvalConfig(Settings):
             _check_out(self.out)
             source, _ = source_and_names(self.puzzle) if self.puzzle else (None, None)
             _check_kept(self.out, "puzzle", source)
-        if self.sheet is not None and Path(self.sheet).suffix != ".png":
-            raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
         if self.puzzle is not None:
             _refuse(self.changes, OF_TARGETS, "puzzle", "leave puzzle out")
 
@@ -182,13 +176,6 @@ class PlayConfig(Settings):
         None,
         "the same, and its pieces are not told: how the run's tokens fill it is searched first",
         only={"puzzle": None, "target": None},
-    )
-    solutions: int = setting(
-        1,
-        "draw so many different ways to fill the silhouette, if there are; the first is laid",
-        low=1,
-        high=MAX_SOLUTIONS,
-        unless={"silhouette": None},
     )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
     changes: Changes = field(default_factory=dict)

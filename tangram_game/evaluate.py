@@ -5,7 +5,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from tangram_game.config import ALL, EvalConfig, source_and_names
 from tangram_game.figures.puzzles import Player, by, find_figures
 from tangram_game.scores import (
     RUN,
-    Scored,
     Scores,
     of_each,
     of_outlines,
@@ -33,12 +31,10 @@ from tangram_game.scores import (
     score_puzzles,
 )
 from tangram_sim.config import SimConfig
-from tangram_sim.drawing.game_drawing import figure_sheet
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 from worker.score.test_set import FixedTests
 
-MAX_PICTURES = 100  # on a sheet
 MAX_PADDED = 4  # policies in a table
 MAX_LINES = 40  # of puzzles and of faults on the screen
 
@@ -130,7 +126,7 @@ def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
 
 
 def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
-    """Assemble the puzzles, print the scores and draw the sheet; the file's content."""
+    """Assemble the puzzles and print the scores; the file's content."""
     source, names = source_and_names(config.puzzle or ())
     task = run.task
     figures = find_figures(source, task, names, config.turns)
@@ -143,9 +139,6 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     caption = f"{which}, {_told(task)}; {scored.told}"
     console.print(scores_table(_title(run), caption, task.scores, scores))
     console.print(puzzles_table(lines, full=config.out))
-    if config.sheet is not None:
-        write_sheet(config.sheet, task, scored)
-        console.print(f"written: {config.sheet}", markup=False, soft_wrap=True)
     return _report(run, config, scores) | {
         "puzzle": list(config.puzzle or ()),
         "turns": config.turns,
@@ -192,19 +185,6 @@ def _observed(sim: SimConfig) -> str:
     if sim.observe == "silhouette":
         return "exact outlines, pieces hidden"
     return "exact corners"
-
-
-def write_sheet(path: str, task: Place, scored: Scored) -> None:
-    """Write a picture of every figure's end, of at most `MAX_PICTURES`.
-
-    Raises:
-        RunError: the file is not writable.
-    """
-    picture = BytesIO()
-    ends, goals = scored.ends[:MAX_PICTURES], scored.goals[:MAX_PICTURES]
-    sheet = figure_sheet(task.layout, task.sim.arena, ends, goals, scored.titles[:MAX_PICTURES])
-    sheet.save(picture, format="PNG")
-    write_whole(Path(path), picture.getvalue())
 
 
 def scores_table(

@@ -109,8 +109,8 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
     if config.target is not None:
         return photograph_show(run, config, config.target)
     if config.silhouette is not None:
-        given = (config.silhouette, run.task, config.solutions)
-        return silhouette_show(run, config, silhouette or read_silhouette(*given))
+        found = silhouette or read_silhouette(config.silhouette, run.task)
+        return silhouette_show(run, config, found)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.task, play_episodes(run, config), titles, "episode")
 
@@ -162,8 +162,7 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     """
     task, fills = _beside(run.task), run.task.outlines
     played = play_figures(task, [found.figure], by(run.actor), config.seed)
-    width = WIDTH if _is_still(config.out) else WIDTH // 2
-    seen = draw_silhouette(found, task.layout, width, bare=SHOWN * fills)
+    seen = draw_silhouette(found, task.layout, bare=SHOWN * fills)
     told = found.told
     if fills:
         solved = assembled(task.layout, played).iou[0] >= SOLVED

@@ -158,7 +158,7 @@ def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
     found = answer(name, source, task.layout, task.tokens.scale, seconds, method=_method(who))
     if source == LAYOUT and found.drawn.share is not None:
         raise ConfigError("the tans lie on each other: move them apart")
-    first = found.drawn.filled[0]
+    first = found.drawn.filled
     how = f"{source[0].upper()}{source[1:]} {found.told.partition(';')[0]}."
     if found.exact:
         how = f"filled by the {_called(who, first.by)} in {first.seconds:.2f} s"
@@ -179,7 +179,7 @@ def _called(who: str, by: str) -> str:
 
 
 def _answer(answered: Answered, how: str, solution: Solution) -> Answer:
-    task, drawn, found = player().run.task, answered.drawn, answered.ways[0]
+    task, drawn, found = player().run.task, answered.drawn, answered.lies
     layout = task.layout
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
     check_inside("the figure", task, layout.corners(poses, found.flipped), "draw it less long")

@@ -3,7 +3,6 @@
 import time
 from dataclasses import dataclass
 
-from tangram_core.run.outcome import plural
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
 from tangram_sim.puzzles.assembly import COUNTS
@@ -23,23 +22,22 @@ class Answer:
 
     Attributes:
         drawn: what was shown.
-        ways: how they fill it, in different ways; or the one that comes nearest.
+        lies: how they fill it, or come nearest.
         exact: whether they fill it.
-        iou: area that figure and tokens share over the area of both together, of the first way.
+        iou: area that figure and tokens share over the area of both together.
         told: how it was filled, or why not, in words.
         seconds: of processor time that it took.
     """
 
     drawn: Silhouette
-    ways: tuple[Dissection, ...]
+    lies: Dissection
     exact: bool
     iou: float
     told: str
     seconds: float
 
     def solution(self, layout: Layout, scale: float, source: str) -> Solution:
-        """The first way as data; the side of the full square is in units of the layout."""
-        lies = self.ways[0]
+        """The same as data; the side of the full square is in units of the layout."""
         return Solution(
             source=source,
             kind="filled" if self.exact else "nearest",
@@ -47,7 +45,7 @@ class Answer:
             iou=round(self.iou, 6),
             seconds=round(self.seconds, 3),
             picture=Picture(*self.drawn.picture.size),
-            tokens=tokens_of(layout, scale, lies, self.drawn.corners(layout, lies)),
+            tokens=tokens_of(layout, scale, self.lies, self.drawn.corners(layout, self.lies)),
         )
 
 
@@ -64,7 +62,6 @@ def answer(
     layout: Layout,
     scale: float,
     seconds: float = SECONDS,
-    count: int = 1,
     method: Method = UNLEARNED,
 ) -> Answer:
     """Fill a figure, or come near to it with all tokens; see `fill_silhouette`.
@@ -73,29 +70,20 @@ def answer(
         ConfigError: a file that cannot be used.
     """
     begin = time.thread_time()
-    drawn = fill_silhouette(name, source, layout, scale, seconds, count, method)
-    first, ways = drawn.filled[0], [one.found for one in drawn.filled if one.solved]
-    laid = tuple(one for one in ways if one is not None)
-    if laid:
-        told = _filled(drawn, seconds, count)
-        return Answer(drawn, laid, True, first.iou, told, time.thread_time() - begin)
-    starts = [one for one in (first.found, first.attempt) if one is not None]
+    drawn = fill_silhouette(name, source, layout, scale, seconds, method)
+    filled = drawn.filled
+    if filled.found is not None and filled.solved:
+        told = f"filled by the {filled.by} in {filled.seconds:.2f} s, IoU {filled.iou:.3f}"
+        taken = time.thread_time() - begin
+        return Answer(drawn, filled.found, True, filled.iou, told, taken)
+    starts = [one for one in (filled.found, filled.attempt) if one is not None]
     found, iou = nearest_figure(drawn.area, layout, NEAREST_SECONDS, starts=starts)
     told = f"{_unfilled(drawn, layout)}; the nearest figure has IoU {iou:.3f} with it"
-    return Answer(drawn, (found,), False, float(iou), told, time.thread_time() - begin)
-
-
-def _filled(drawn: Silhouette, seconds: float, count: int) -> str:
-    first, found = drawn.filled[0], len(drawn.filled)
-    if count == 1:
-        return f"filled by the {first.by} in {first.seconds:.2f} s, IoU {first.iou:.3f}"
-    others = ", all that there are" if first.complete else ""
-    more = "" if found == count or first.complete else f", no more in {seconds:g} s"
-    return f"{plural(found, 'dissection')}{others}{more}"
+    return Answer(drawn, found, False, float(iou), told, time.thread_time() - begin)
 
 
 def _unfilled(drawn: Silhouette, layout: Layout) -> str:
-    (filled,) = drawn.filled
+    filled = drawn.filled
     names = ", ".join(shape.name for shape in layout.shapes)
     tokens = "the seven tans" if has_all_tans(layout) else names
     if drawn.share is not None:

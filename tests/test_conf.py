@@ -389,7 +389,7 @@ def test_entry_hands_over_plain_settings(entered: Entered) -> None:
     assert type(settings) is dict
     assert settings == (
         {"run_dir": "x", "episodes": 100, "seed": 3, "rivals": ["all"], "turns": 1}
-        | dict.fromkeys(("out", "puzzle", "sheet"))
+        | dict.fromkeys(("out", "puzzle"))
         | {group: dict.fromkeys(laid_over(group)) for group in OVER}
     )
 

@@ -162,8 +162,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.relabel_share": (GOAL, 0.0),
     "agent.action_penalty": (GOAL, 1.0),
     "agent.actor_delay": (GOAL, 1),
-    "agent.smoothing": (GOAL, 0.4),
-    "agent.entropy": (SAC, 0.5),
     "agent.width": (PUSH, 9),
     "agent.looked_at": (PUSH, 64),
     "agent.tried": (PUSH, 64),

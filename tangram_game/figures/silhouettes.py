@@ -2,7 +2,7 @@
 
 What nothing fills is approached: the run lays the tokens as near to it as was found.
 
-Legend: H x W pixels of a picture, N ways to fill it, V corners.
+Legend: H x W pixels of a picture, V corners.
 """
 
 from dataclasses import dataclass
@@ -14,10 +14,8 @@ from PIL import Image, ImageDraw, ImageFilter
 
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
-from tangram_core.settings import refuse_ignored
 from tangram_game.figures.puzzles import Figure, check_inside
 from tangram_game.show.views import outlined
-from tangram_sim.drawing.game_drawing import tiles
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.targets import turned_figure
@@ -37,8 +35,8 @@ class Shown:
 
     Attributes:
         picture: of it, in colour.
-        outlines: (N, V, 2) corners of the tokens, pixels of the picture, y down.
-        figure: the tokens in the middle of a run's arena, as the first way has them.
+        outlines: (V, 2) corners of the tokens, pixels of the picture, y down.
+        figure: the tokens in the middle of a run's arena.
         exact: whether they fill it.
         told: how it was filled, in words.
     """
@@ -50,18 +48,16 @@ class Shown:
     told: str
 
 
-def answered(name: str, source: str, task: Place, count: int = 1) -> "Answer":
+def answered(name: str, source: str, task: Place) -> "Answer":
     """How a run's tokens make a figure.
 
     Args:
         name: of a file, or of a puzzle of the library.
         source: what errors call it.
         task: the run.
-        count: of different ways to fill it, at most.
 
     Raises:
-        ConfigError: it cannot be read, or OpenCV or shapely is not installed; or there is one way
-            at most that can be shown.
+        ConfigError: it cannot be read, or OpenCV or shapely is not installed.
     """
     try:
         # Only here: other targets need neither.
@@ -73,56 +69,46 @@ def answered(name: str, source: str, task: Place, count: int = 1) -> "Answer":
             "shapely, or name a puzzle, as in puzzle=cat"
         ) from error
     layout, method = task.layout, together(task.layout)
-    if task.outlines and count > 1:
-        refuse_ignored(f"solutions={count}", "an agent of outlines", "name another run")
-    seconds = solving.SECONDS
-    return solving.answer(name, source, layout, task.tokens.scale, seconds, count, method)
+    return solving.answer(name, source, layout, task.tokens.scale, solving.SECONDS, method)
 
 
-def read_silhouette(name: str, task: Place, count: int = 1) -> Shown:
+def read_silhouette(name: str, task: Place) -> Shown:
     """A silhouette, and a run's tokens in it; see `answered`.
 
     Raises:
         ConfigError: see there; or the tokens would reach out of the run's arena.
     """
     source, layout = f"silhouette={name}", task.layout
-    answer = answered(name, source, task, count)
-    first = answer.ways[0]
-    poses = turned_figure(layout, (first.poses, first.flipped), 0.0)
-    corners = layout.corners(poses, first.flipped)
+    answer = answered(name, source, task)
+    lies = answer.lies
+    poses = turned_figure(layout, (lies.poses, lies.flipped), 0.0)
+    corners = layout.corners(poses, lies.flipped)
     check_inside(
         source, task, corners, "draw it less long, or write out=solution.json, which needs no arena"
     )
-    outlines = np.stack([answer.drawn.corners(layout, one) for one in answer.ways])
+    outlines = answer.drawn.corners(layout, lies)
     picture = answer.drawn.picture
     if not answer.exact:
-        picture = _reddened(picture, answer.drawn.mask, outlines[0], layout)
-    figure = Figure(Path(name).stem, 0.0, poses, first.flipped)
+        picture = _reddened(picture, answer.drawn.mask, outlines, layout)
+    figure = Figure(Path(name).stem, 0.0, poses, lies.flipped)
     return Shown(picture, outlines, figure, answer.exact, answer.told)
 
 
 # What is drawn
 
 
-def draw_silhouette(silhouette: Shown, layout: Layout, width: int, bare: str = "") -> Image.Image:
-    """The silhouette with the outlines of the tokens that fill it, in all ways that were found.
+def draw_silhouette(silhouette: Shown, layout: Layout, bare: str = "") -> Image.Image:
+    """The silhouette with the outlines of the tokens in it.
 
     Args:
         silhouette: what was found.
         layout: the tokens.
-        width: of all ways together in pixels, about; one alone is as wide as a film.
         bare: what it is called without any tokens, as an agent of outlines is shown it.
     """
-    if bare:
-        nobody = np.zeros(layout.tokens, np.bool_)
-        picture = outlined(silhouette.picture, layout, silhouette.outlines[0], _TILE, nobody)
-        return contact_sheet([picture], 1, [bare])
-    count = len(silhouette.outlines)
-    columns, size = tiles(count, _TILE if count == 1 else width)
-    pictures = [outlined(silhouette.picture, layout, one, size) for one in silhouette.outlines]
-    captions = [f"{i + 1} of {count}" for i in range(count)]
-    alone = silhouette.told if silhouette.exact else "the nearest figure; red: missing or over"
-    return contact_sheet(pictures, columns, captions if count > 1 else [alone])
+    shown = np.full(layout.tokens, not bare)
+    picture = outlined(silhouette.picture, layout, silhouette.outlines, _TILE, shown)
+    told = silhouette.told if silhouette.exact else "the nearest figure; red: missing or over"
+    return contact_sheet([picture], 1, [bare or told])
 
 
 def _reddened(picture: Image.Image, mask: Bools, corners: Floats, layout: Layout) -> Image.Image:

@@ -6,7 +6,7 @@ angle are free, and so is its scale: the area tells it, also where a file tells 
 Legend: H x W pixels of a picture.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 
@@ -37,6 +37,7 @@ from tangram_vision.silhouettes.tilts import mapped, shift
 _DRAWN = 640  # pixels along the longer side of an outline that is drawn
 _BORDER = 0.1  # of it, around the outline
 _INK, _PAPER = (55, 60, 68), (250, 250, 247)
+_LINES = 4  # times as much as is drawn lies within lines; of tans around a hole less
 _OFF = 0.05  # of the tokens' area, by which that of a drawing of known scale may be wrong
 
 
@@ -47,7 +48,7 @@ class Silhouette:
     Attributes:
         picture: of it, in colour.
         mask: (H, W) which of its pixels are the silhouette's.
-        filled: how, in different ways, or how it was tried; poses are in the units of the layout.
+        filled: how, or how it was tried; poses are in the units of the layout.
         drawing: homography (3, 3) of points in such units to columns and rows of the picture.
         area: of it, in such units.
         share: its area over that of the tokens where the file tells its scale, and they differ.
@@ -55,7 +56,7 @@ class Silhouette:
 
     picture: Image.Image
     mask: Bools
-    filled: tuple[Filled, ...]
+    filled: Filled
     drawing: Floats
     area: Area
     share: float | None = None
@@ -71,7 +72,6 @@ def fill_silhouette(
     layout: Layout,
     scale: float,
     seconds: float,
-    count: int = 1,
     method: Method = UNLEARNED,
 ) -> Silhouette:
     """Read a silhouette and fill it.
@@ -82,7 +82,6 @@ def fill_silhouette(
         layout: the tokens.
         scale: side of the full square that they are cut from, in their units.
         seconds: for the search.
-        count: of different ways to fill it, at most.
         method: how it is filled.
 
     Raises:
@@ -90,17 +89,12 @@ def fill_silhouette(
     """
     path = Path(name)
     if path.suffix.lower() not in SUFFIXES:
-        return _from_outline(read_outline(name, source), layout, scale, seconds, count, method)
-    if count > 1:
-        raise ConfigError(
-            f"solutions={count} needs an exact outline, and {source} is a picture, whose pixels "
-            "are fitted by one: leave solutions out, or write the outline as JSON"
-        )
+        return _from_outline(read_outline(name, source), layout, scale, seconds, method)
     return _from_picture(read_picture(path, source), source, layout, seconds, method)
 
 
 def _from_outline(
-    drawn: Drawn, layout: Layout, scale: float, seconds: float, count: int, method: Method
+    drawn: Drawn, layout: Layout, scale: float, seconds: float, method: Method
 ) -> Silhouette:
     """Scaled to the tokens' area, filled, and drawn."""
     area, total = drawn.area, float(layout.areas.sum())
@@ -108,10 +102,10 @@ def _from_outline(
     share = None if drawn.side is None else float(area.area * (scale / drawn.side) ** 2 / total)
     wrong = share is not None and abs(share - 1.0) > _OFF
     placed, size, unit = _framed(area, own)
-    every = tuple(fill_outline(placed, layout, seconds, count, method))
+    filled = fill_outline(placed, layout, seconds, method)
     mask = _mask(placed, size, unit)
     drawing = np.diag([unit, -unit, 1.0])
-    return Silhouette(_inked(mask), mask, every, drawing, placed, share if wrong else None)
+    return Silhouette(_inked(mask), mask, filled, drawing, placed, share if wrong else None)
 
 
 def _framed(area: Area, scale: float) -> tuple[Area, tuple[int, int], float]:
@@ -148,7 +142,7 @@ def _from_picture(
     picture: Image.Image, source: str, layout: Layout, seconds: float, method: Method
 ) -> Silhouette:
     """The scale is that at which as many pixels are covered as the tokens are large."""
-    shade = find_silhouette(picture, layout, source)
+    shade = _closed(find_silhouette(picture, layout, source))
     share = float(shade.cover.sum()) / shade.cover.size
     view = float(np.sqrt(layout.areas.sum() / share))
     filled = fill_picture(shade.cover, layout, view, seconds, method)
@@ -158,7 +152,17 @@ def _from_picture(
         raise ConfigError(
             f"{source} shows lines that are too thin to have an area: fill the figure with one tone"
         )
-    return Silhouette(picture, _shaded(shade, picture.size), (filled,), drawing, area)
+    return Silhouette(picture, _shaded(shade, picture.size), filled, drawing, area)
+
+
+def _closed(shade: Shade) -> Shade:
+    """What a figure that is drawn by lines alone encloses; any other as it is."""
+    mask = (shade.cover > 0.5).astype(np.uint8)
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    whole = cv2.drawContours(np.zeros_like(mask), contours, -1, 1, cv2.FILLED)
+    if whole.sum() < _LINES * mask.sum():
+        return shade
+    return replace(shade, cover=np.asarray(whole, np.float32))
 
 
 def _traced(cover: Singles, unit: float) -> Area:

@@ -22,6 +22,8 @@ from tangram_sim.puzzles.sketches import read_text
 SIDE = 2400  # pixels of a square that the whole drawing goes into
 SECONDS, BYTES = 10, 2 << 30  # that drawing may take
 _BORDER = SIDE // 8  # around it
+_WIDER = 3  # times as wide is the page on which it is seen whether it was cut off,
+_BEYOND = 1.02  # and more than so many times as much is drawn there
 _SEEN = 24  # levels of any colour by which a figure differs from its ground
 _REFUSED = {"text": "convert it to paths", "image": "give the picture itself"}
 # As a picture in another one it stays within this size, and reads no other file.
@@ -47,13 +49,21 @@ def read_svg(path: Path, source: str) -> Image.Image:
         ConfigError: it cannot be used, and why.
     """
     text = read_text(path, source)
-    _check(text, source)
+    root = _checked(text, source)
     pixels = _drawn(text, source)
     there = np.flatnonzero(pixels[..., 3].any(axis=0)), np.flatnonzero(pixels[..., 3].any(axis=1))
     if not len(there[0]):
         raise ConfigError(f"{source} draws nothing that has an area: draw an outline")
     (left, *_, right), (top, *_, low) = (one[[0, -1]] for one in there)
-    figure = _figure(pixels[top : low + 1, left : right + 1])
+    shown = pixels[top : low + 1, left : right + 1]
+    figure = _figure(shown)
+    # A page of another colour than white would be a figure itself.
+    coloured = shown[..., 3].all() and (shown[0, 0, :3] < 256 - _SEEN).any()
+    wider = None if coloured else _wider(root)
+    if wider is not None:
+        beyond = np.count_nonzero(_figure(_drawn(wider, source)))
+        if beyond * _WIDER**2 > _BEYOND * np.count_nonzero(figure):
+            raise ConfigError(f"{source} is cut off: it reaches out of its viewBox, enlarge that")
     return Image.fromarray(np.where(np.pad(figure, _BORDER), 0, 255).astype(np.uint8))
 
 
@@ -93,8 +103,36 @@ def _drawn(text: str, source: str) -> AnyArray:
     return drawn
 
 
-def _check(text: str, source: str) -> None:
-    """Refuse what is no SVG, and what is drawn otherwise elsewhere, as text is by other fonts."""
+def _wider(root: ET.Element) -> str | None:
+    """The same drawing with room around its page, without a rectangle that covers the page.
+
+    None where the page is not told in numbers, or where something is sized by it.
+    """
+    try:
+        page = [float(one) for one in re.split(r"[\s,]+", (root.get("viewBox") or "").strip())]
+        x, y, width, height = page
+    except ValueError:
+        return None
+    for parent in root.iter():
+        for child in [one for one in parent if one.get("width") == one.get("height") == "100%"]:
+            parent.remove(child)
+    if any("%" in value for one in root.iter() for value in one.attrib.values() if one is not root):
+        return None
+    more = (_WIDER - 1) / 2
+    root.set(
+        "viewBox", f"{x - more * width} {y - more * height} {_WIDER * width} {_WIDER * height}"
+    )
+    for name in ("width", "height"):
+        root.attrib.pop(name, None)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _checked(text: str, source: str) -> ET.Element:
+    """The root of what can be drawn.
+
+    Raises:
+        ConfigError: it is no SVG, or is drawn otherwise elsewhere, as text is by other fonts.
+    """
     if re.search(r"<!\s*(doctype[^<>]*\[|entity)", text, re.IGNORECASE):
         raise ConfigError(f"{source} must have no ENTITY and no DOCTYPE with [...]: delete them")
     try:
@@ -111,3 +149,4 @@ def _check(text: str, source: str) -> None:
     styles += [one.text or "" for one in root.iter() if str(one.tag).endswith("style")]
     if any(re.search(r"(?<![-\w])transform\s*:(?!\s*none)", style) for style in styles):
         raise ConfigError(f"{source} has a style with a transform: write it as an attribute")
+    return root

@@ -6,7 +6,7 @@ laid. Legend: K tokens.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -29,7 +29,6 @@ _ROUND = 1e-9  # of the tokens' size, to which corners are rounded
 _STRAIGHT, _GRID = 1e-4, 1e-6
 _SHARE = 0.9  # of the time, for the search; the rest is for the best attempt
 _LOOSE = (0.004, 0.022, 0.05)  # tolerances of a beam, for outlines
-_SAME = 0.9  # of a token's area, from which two lie at one place
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,10 +113,8 @@ def silhouette(layout: Layout, laid: Dissection) -> Area:
     return shapely.normalize(shapely.union_all(parts))
 
 
-def fill_outline(
-    area: Area, layout: Layout, seconds: float, count: int = 1, method: Method = UNLEARNED
-) -> list[Filled]:
-    """Up to `count` different dissections of an outline of the tokens' area, or one that failed.
+def fill_outline(area: Area, layout: Layout, seconds: float, method: Method = UNLEARNED) -> Filled:
+    """A dissection of an outline of the tokens' area, or an attempt.
 
     The search is complete, so that what a beam lays after it is no more than an attempt.
 
@@ -125,24 +122,18 @@ def fill_outline(
         area: in the units of the layout.
         layout: its tokens.
         seconds: for all of it.
-        count: at most so many; a beam finds one.
         method: how.
     """
     tokens, begin = Tokens(layout), time.thread_time()
     budget, tried = Budget(begin + _SHARE * seconds), list[list[Laid]]()
     for tolerance in TOLERANCES if method.search else ():
         search = Search(tokens, tolerance * tokens.unit, budget)
-        every: list[Filled] = []
         for laid in search.run(area):
             found = dissection(tokens, laid)
             iou = overlap(covered(layout, found), area)
-            if iou >= SOLVED and not any(_alike(tokens, layout, found, one.found) for one in every):
+            if iou >= SOLVED:
                 passed = time.thread_time() - begin
-                every.append(Filled(found, iou, passed, budget.taken, False))
-            if len(every) == count:
-                return every
-        if every:
-            return [replace(one, complete=not budget.spent()) for one in every]
+                return Filled(found, iou, passed, budget.taken, False)
         tried.append(search.best)
         if budget.spent():
             break
@@ -151,10 +142,10 @@ def fill_outline(
     passed = time.thread_time() - begin
     if method.search:
         complete = not budget.spent()
-        return [Filled(None, iou, passed, budget.taken, complete, nearest)]
+        return Filled(None, iou, passed, budget.taken, complete, nearest)
     if nearest is not None and nearest.lies is None and iou >= SOLVED:
-        return [Filled(nearest, iou, passed, loose.taken, False, by="beam")]
-    return [Filled(None, iou, passed, loose.taken, False, nearest)]
+        return Filled(nearest, iou, passed, loose.taken, False, by="beam")
+    return Filled(None, iou, passed, loose.taken, False, nearest)
 
 
 def nearest_fill(
@@ -177,15 +168,3 @@ def nearest_fill(
     ]
     best = int(np.argmax(np.array(shares) - np.array(twice) / area.area))
     return found[best], shares[best]
-
-
-def _alike(tokens: Tokens, layout: Layout, one: Dissection, other: Dissection | None) -> bool:
-    """Whether two dissections differ by nothing but which of equal tokens lies where."""
-    if other is None:
-        return False
-    mine, theirs = np.array(pieces(layout, one)), np.array(pieces(layout, other))
-    for own in map(list, tokens.own):
-        common = shapely.area(shapely.intersection(mine[own][:, None], theirs[own]))
-        if (common.max(axis=1) < _SAME * shapely.area(mine[own])).any():
-            return False
-    return True

@@ -173,7 +173,7 @@ def test_a_film_as_mp4_shows_the_same_for_as_long(tmp_path: Path) -> None:
 
 def test_without_pyav_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tangram_game.config.find_spec", lambda _: None)
-    with pytest.raises(ConfigError, match=r"out=a.mp4 needs PyAV, .*: pip install 'tangram-rl.vid"):
+    with pytest.raises(ConfigError, match=r"out=a.mp4 needs PyAV, .*: pip install av"):
         PlayConfig("run", out="a.mp4")
 
 

@@ -111,7 +111,7 @@ def test_a_wider_beam_fills_more() -> None:
     """A beam of one fills none of these."""
     methods = [Method(search=False, width=width) for width in (1, 12)]
     solved = [
-        [fill_outline(gluing(seed), LAYOUT, 60.0, method=method)[0].solved for seed in (1, 6, 7)]
+        [fill_outline(gluing(seed), LAYOUT, 60.0, method=method).solved for seed in (1, 6, 7)]
         for method in methods
     ]
     assert sum(solved[0]) + 1 < sum(solved[1])

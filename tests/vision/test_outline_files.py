@@ -71,7 +71,7 @@ def test_a_side_tells_the_area(tmp_path: Path, width: float, share: float | None
 def test_without_a_side_nothing_is_said_of_the_area(tmp_path: Path) -> None:
     drawn = filled(tmp_path / "it.json", np.array(SQUARE) * 17.0)
     assert drawn.share is None
-    assert drawn.filled[0].solved
+    assert drawn.filled.solved
 
 
 WRONG = {
@@ -131,7 +131,7 @@ def test_what_nothing_fills_is_left_in_time(
     looks = count()
     monkeypatch.setattr(time, "thread_time", lambda: 0.05 * next(looks))
     drawn = filled(tmp_path / "it.json", *rings)
-    assert not drawn.filled[0].solved
+    assert not drawn.filled.solved
     assert next(looks) < 40  # 20 of them are the time that it is given
 
 

@@ -93,6 +93,16 @@ def test_whatever_differs_from_the_ground_is_the_figure(tmp_path: Path, content:
     assert (pixels < 128).sum() == pytest.approx(np.pi / 4 * high * wide, rel=0.02)
 
 
+@pytest.mark.parametrize("ground", ["", '<rect width="100%" height="100%" fill="white"/>'])
+def test_what_reaches_out_of_its_page_is_cut_off(tmp_path: Path, ground: str) -> None:
+    def drawn(right: int) -> np.ndarray:
+        return read(tmp_path, f'{HEAD}{ground}<polygon points="9,9 {right},9 {right},300"/></svg>')
+
+    assert (drawn(300) < 128).any()  # to the page's very edge
+    with pytest.raises(ConfigError, match="is cut off: it reaches out of its viewBox, enlarge"):
+        drawn(400)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

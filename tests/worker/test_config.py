@@ -37,14 +37,10 @@ WRONG = {
         *[({"out": out}, "out must name a file") for out in ("", "/", ".")],
         (TESTED | {"turns": 0}, "turns must be between 1 and 360, got 0"),
         (TESTED | {"turns": 361}, "turns must be between 1 and 360, got 361"),
-        (TESTED | {"sheet": "ends.gif"}, "sheet must end with .png, got 'ends.gif'"),
         (TESTED | {"episodes": 5}, "episodes=5 changes nothing with puzzle=[test]: leave it at"),
         *[
             ({name: value}, f"{name}={shown} changes nothing with puzzle=null: leave it")
-            for name, value, shown in (
-                ("turns", 2, "2"),
-                ("sheet", "a.png", "a.png"),
-            )
+            for name, value, shown in (("turns", 2, "2"),)
         ],
         *[
             (TESTED | {"changes": {"sim": {name: 1}}}, f"sim.{name}=1 changes nothing with puzzle:")
@@ -54,7 +50,7 @@ WRONG = {
     PlayConfig: [
         *OF_A_RUN,
         *[
-            ({"out": out}, "out must end with .gif, .mp4, .png, .json, got")
+            ({"out": out}, "out must end with .gif, .mp4, .png, .json, .svg, got")
             for out in ("film.webm", "film", "", "gif", "film.GIF.txt")
         ],
         ({"run_dir": None}, "say which run: run_dir=runs/..."),
@@ -151,7 +147,6 @@ def test_paths_are_seen_from_the_callers_folder(
         ("run_dir", "/b", "/b"),
         ("run_dir", "pretrained/mine", f"{tmp_path}/pretrained/mine"),
         ("out", "pretrained/x.png", f"{tmp_path}/pretrained/x.png"),
-        ("sheet", "a.png", f"{tmp_path}/a.png"),
         ("puzzle", "mine.json", (f"{tmp_path}/mine.json",)),
         ("puzzle", ["mine.json", "cat"], (f"{tmp_path}/mine.json", "cat")),
         ("puzzle", "test", ("test",)),

@@ -29,20 +29,6 @@ class GoalConfig(BaseConfig, section="agent"):
     actor_delay: int = setting(
         2, "updates for each one of the actor", low=1, only={"algorithm": "td3"}, part=LEARNING
     )
-    smoothing: float = setting(
-        0.2,
-        "deviation of the noise on actions in targets, cut at 0.5",
-        low=0,
-        only={"algorithm": "td3"},
-        part=LEARNING,
-    )
-    entropy: float = setting(
-        1.0,
-        "the actor's entropy is kept at minus this for each entry of an action",
-        low=-10,
-        only={"algorithm": "sac"},
-        part=LEARNING,
-    )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from tangram_agent.agents.goal.gaussian import GaussianPolicy, Temperature
 from tangram_agent.flat.actor_critic import ActorCritic, Batch, Loss
 from tangram_agent.flat.networks import Critics
 
-MOST_SMOOTHED = 0.5  # Fujimoto et al. 2018
+SMOOTHING, MOST_SMOOTHED = 0.2, 0.5  # of noise on actions in targets: Fujimoto et al. 2018
 
 
 class GoalLearner(ActorCritic[GoalConfig]):
@@ -67,7 +67,7 @@ class GoalLearner(ActorCritic[GoalConfig]):
         else:
             actions = self.targets["actor"](following)
             if config.algorithm == "td3":
-                noise = config.smoothing * batch.normals[0]
+                noise = SMOOTHING * batch.normals[0]
                 actions = actions + noise.clamp(-MOST_SMOOTHED, MOST_SMOOTHED)
                 actions = actions.clamp(-1.0, 1.0)
         value = self.targets["critic"](following, actions).amin(0) - bonus
@@ -83,5 +83,5 @@ class GoalLearner(ActorCritic[GoalConfig]):
         worth = self.temperature().detach()
         loss = (worth * density - value).mean() + self.config.action_penalty * penalty
         yield Loss("actor", loss, {"effort": penalty, "entropy": -density.mean()})
-        lacking = (density.detach().mean() - self.config.entropy * self.actions).detach()
+        lacking = (density.detach().mean() - self.actions).detach()
         yield Loss("temperature", -self.temperature.logarithm * lacking, {"temperature": worth})

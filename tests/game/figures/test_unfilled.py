@@ -1,4 +1,4 @@
-"""Silhouettes that cannot be filled are approached, and several dissections are drawn."""
+"""Silhouettes that cannot be filled are approached."""
 
 import json
 from pathlib import Path
@@ -10,9 +10,7 @@ from PIL import Image, ImageDraw
 
 from conf.cli import composed
 from tangram_agent.runs import load_run
-from tangram_core.errors import ConfigError
 from tangram_game.cli import _play
-from tangram_game.config import PlayConfig
 from tangram_game.figures.silhouettes import RED, read_silhouette
 from tangram_vision import solving
 
@@ -37,7 +35,7 @@ def outline(path: Path, *rings: Any, **more: Any) -> str:
 def near(name: str, least: float) -> str:
     """What is told of a figure that nothing fills, and that comes so near."""
     shown = read_silhouette(name, load_run("pretrained/tangram7").task)
-    assert (shown.exact, len(shown.outlines)) == (False, 1)
+    assert not shown.exact
     why, _, how = shown.told.partition("; ")
     assert float(how.removeprefix("the nearest figure has IoU ").removesuffix(" with it")) > least
     differs = (np.asarray(shown.picture.convert("RGB")) == RED).all(axis=2)
@@ -87,51 +85,3 @@ def test_the_command_searches_once(
     assert _play(composed("play", given)) == 0
     assert searched == [name]
     assert (tmp_path / "it.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "told"),
-    [("square.json", "5 dissections"), ("cat", "2 dissections, all that there are")],
-)
-def test_so_many_dissections_are_found(tmp_path: Path, name: str, told: str) -> None:
-    outline(tmp_path / "square.json", SQUARE)
-    source = name if name == "cat" else str(tmp_path / name)
-    shown = read_silhouette(source, load_run("pretrained/tangram7").task, 5)
-    assert shown.told == told
-    assert len(shown.outlines) == int(told[0])
-    assert shown.figure.name == Path(name).stem
-
-
-def test_all_dissections_are_shown_and_the_first_is_played(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tangram_game.show.film.FRAMES_PER_ACTION", 1)
-    name, sizes = outline(tmp_path / "it.json", SQUARE), {}
-    for out in ("it.png", "it.gif"):
-        given = [f"silhouette={name}", "solutions=5", f"out={tmp_path / out}"]
-        assert _play(composed("play", [*given, "sim.backend=kinematic"])) == 0
-        assert "1 silhouette, coverage 0.99" in (printed := capsys.readouterr().out)
-        assert "; 5 dissections" in printed
-        with Image.open(tmp_path / out) as picture:
-            sizes[out] = picture.size
-    assert sizes["it.png"][0] > 1400  # three in a row, and the end
-    assert sizes["it.gif"][0] < 600  # as wide as the film
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"solutions": 5}, "^solutions=5 changes nothing with silhouette=null: "),
-        ({"solutions": 0, "silhouette": "cat"}, "solutions must be between 1 and 20, got 0"),
-        ({"solutions": 21, "silhouette": "cat"}, "solutions must be between 1 and 20, got 21"),
-    ],
-)
-def test_solutions_are_those_of_a_silhouette(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        PlayConfig(**({"run_dir": "pretrained/tangram7"} | settings))
-
-
-def test_of_a_picture_one_dissection_is_known(tmp_path: Path) -> None:
-    task = load_run("pretrained/tangram7").task
-    with pytest.raises(ConfigError, match=r"solutions=2 needs an exact outline, and .*it\.png is"):
-        read_silhouette(str(tmp_path / "it.png"), task, 2)

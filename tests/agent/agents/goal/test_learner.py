@@ -175,8 +175,7 @@ def test_a_run_begins_with_anothers_networks_and_new_optimisers() -> None:
         ({"goals": ()}, "agent.goals must name at least one"),
         ({"goals": ("past",)}, "agent.goals must be one of future, next, final"),
         ({"batch_size": 101}, "must not exceed agent.replay_capacity"),
-        ({"algorithm": "ddpg", "smoothing": 0.1}, "agent.smoothing=0.1 changes nothing with"),
-        ({"entropy": 0.5}, "agent.entropy=0.5 changes nothing with agent.algorithm=td3"),
+        ({"algorithm": "ddpg", "actor_delay": 3}, "agent.actor_delay=3 changes nothing with"),
         ({"gamma": 1.0}, "agent.gamma must be between 0 and"),
     ],
 )
