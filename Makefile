@@ -64,8 +64,8 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 # Given again, it goes on; what has its rows in docs/results is not made again: what conf/studies.yaml has may be deleted and made anew.
 study = $(BIN)/tangram-experiment study=$(1) budget=$(2) seeds=10 run_dir=runs/evidence out=docs/results $(ARGS)
 evidence: .venv/.installed-dev  ## what README and docs show of trainings and docs/results lacks: all of it takes a day
-	@$(call study,paper,laptop)
-	@$(call study,paper_size,paper)
+	@$(call study,paper,paper)
+	@$(call study,token,laptop)
 	@$(call study,parts,laptop)
 	@$(call study,game,laptop)
 	@$(call study,pictures,laptop)

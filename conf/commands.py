@@ -246,7 +246,7 @@ those that come with tangram-rl or your own, see docs/puzzles.md.""",
         (
             "tangram-eval run_dir=runs/my_run episodes=1000 out=scores.json",
             "tangram-eval run_dir=runs/my_run sim.actions_per_token=3 sim.backend=kinematic",
-            "tangram-eval run_dir=runs/my_game puzzle=test turns=8 out=puzzles.json ",
+            "tangram-eval run_dir=runs/my_game puzzle=test turns=8 out=puzzles.json",
         ),
         ("tangram_game.config:EvalConfig",),
         over=OVER,
@@ -256,8 +256,9 @@ those that come with tangram-rl or your own, see docs/puzzles.md.""",
         """\
 Shows a run. It plays episodes with the newest weights of a run, noise off, and draws them.
 It assembles puzzles: those that come with tangram-rl or your own, see docs/puzzles.md.
-With target=photo.png it assembles what a photograph shows, see docs/pictures.md.
-With silhouette=cat.png it finds how tokens fill an outline first, see docs/silhouettes.md.""",
+With target=FILE it takes what you have, a drawing, a black figure, a photograph or a puzzle, says
+what it took it for, and lays it, or what comes nearest to it; see docs/silhouettes.md. With
+out=solution.json or .svg it writes where each token lies.""",
         (
             "tangram-play run_dir=runs/my_run out=tests.png episodes=20",
             "tangram-play puzzle=cat out=cat.gif",

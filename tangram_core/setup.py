@@ -229,8 +229,8 @@ def _check_names(kind: type[Any], mapping: Mapping[str, Any], group: str) -> Non
     for name, value in mapping.items():
         if name not in hints:
             raise ConfigError(
-                f"there is no setting {group}{name}: delete it; a config may have it of an older "
-                "version (CHANGELOG.md)"
+                f"there is no setting {group}{name}: delete it; CHANGELOG.md says what became of "
+                "one of an older version"
             )
         if get_origin(hints[name]) is tuple and not isinstance(value, list | tuple):
             full = f"{group}{name}"

@@ -53,6 +53,7 @@ def _play(settings: Plain) -> int:
     _check_drawings(config)
     stored = _check_played(config)
     _check_data(config, stored)
+    name = "silhouette" if config.target is None else "target"
     if config.target is not None or config.data:
         recognised = _recognised(config, stored)
         if recognised is None:
@@ -62,7 +63,8 @@ def _play(settings: Plain) -> int:
     if config.silhouette is not None:
         from tangram_game.figures.silhouettes import read_silhouette
 
-        filled = read_silhouette(config.silhouette, stored.task)
+        source = f"{name}={config.silhouette}"
+        filled = read_silhouette(config.silhouette, source, stored.task)
     tell(f"loads and plays {config.run}")
     from tangram_game.play import play_run
 
@@ -78,8 +80,8 @@ def _check_data(config: "PlayConfig", stored: "Run") -> None:
     figure = config.target or config.silhouette
     if config.data and figure is None and not (plans and Path(config.out).suffix == ".json"):
         raise ConfigError(
-            f"out={config.out} is for where tokens lie in a figure, or a finger's way: add "
-            "target=cat or a file, or name run_dir=pretrained/hand out=plan.json"
+            f"out={config.out} is for where tokens lie in a figure, or a finger's way: name the "
+            "figure by target=cat or a file, or set run_dir=pretrained/hand out=plan.json"
         )
 
 
@@ -91,15 +93,23 @@ def _recognised(config: "PlayConfig", stored: "Run") -> "PlayConfig | None":
     """
     from dataclasses import replace
 
+    from tangram_core.errors import ConfigError
     from tangram_game.figures import targets
+    from tangram_tasks.place import Place
 
     figure = config.target or config.silhouette
     if figure is None:
         return config
+    if not isinstance(stored.setup.task, Place):
+        raise ConfigError(
+            f"{config.run} plays task={stored.setup.task_kind}, which takes figures of the library "
+            "alone: set puzzle=cat, or leave run_dir out"
+        )
     kind = targets.SILHOUETTE
     if config.target is not None:
         kind = targets.told_apart(figure, stored.task)
-        print(f"target={figure} is taken for {targets.TOLD[kind]}")
+        anew = ", and looked for here" if config.data and kind == targets.PUZZLE else ""
+        print(f"target={figure} is taken for {targets.TOLD[kind]}{anew}")
     if config.data:
         from tangram_core.store.files import write_whole
 

@@ -169,12 +169,12 @@ class PlayConfig(Settings):
     target: str | None = setting(
         None,
         "instead of random targets: a puzzle by name, or a file: a puzzle, a drawing, a black "
-        "figure, a photograph of all tokens of which at most three touch; it is told which",
+        "figure, a photograph of all tokens, three touching at most; what it is taken for is told",
         only={"puzzle": None},
     )
     silhouette: str | None = setting(
         None,
-        "the same, and its pieces are not told: how the run's tokens fill it is searched first",
+        "the same, taken for a figure whose pieces nobody sees: how the tokens fill it is searched",
         only={"puzzle": None, "target": None},
     )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
@@ -196,7 +196,7 @@ class PlayConfig(Settings):
         if self.puzzle is not None:
             _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzle", "leave puzzle out")
         if self.target is not None:
-            _refuse(self.changes, OF_TARGETS, "target", "leave target out")
+            _refuse(self.changes, (*OF_TARGETS, "starts"), "target", "leave target out")
             _check_kept(self.out, "target", self.target)
         if self.silhouette is not None:
             _refuse(self.changes, (*OF_TARGETS, "starts"), "silhouette", "leave silhouette out")

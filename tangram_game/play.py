@@ -109,7 +109,8 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
     if config.target is not None:
         return photograph_show(run, config, config.target)
     if config.silhouette is not None:
-        found = silhouette or read_silhouette(config.silhouette, run.task)
+        name = config.silhouette
+        found = silhouette or read_silhouette(name, f"silhouette={name}", run.task)
         return silhouette_show(run, config, found)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.task, play_episodes(run, config), titles, "episode")
@@ -164,7 +165,7 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     played = play_figures(task, [found.figure], by(run.actor), config.seed)
     seen = draw_silhouette(found, task.layout, bare=SHOWN * fills)
     told = found.told
-    if fills:
+    if fills and found.exact:
         solved = assembled(task.layout, played).iou[0] >= SOLVED
         told = "filled by the run itself" if solved else f"not filled by the run itself, but {told}"
     return Show(task, played, [found.figure.title], "silhouette", seen, told)

@@ -17,7 +17,6 @@ from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.puzzles.sketches import read_text
 
-SUFFIXES = (".json", ".svg")
 Point = tuple[float, float]
 Kind = Literal["filled", "nearest", "seen"]
 _ROUND = 6  # digits after the point

@@ -88,7 +88,7 @@ def _unfilled(drawn: Silhouette, layout: Layout) -> str:
     tokens = "the seven tans" if has_all_tans(layout) else names
     if drawn.share is not None:
         share = f"{drawn.share:.2f}" if 0.01 <= drawn.share < 100.0 else f"{drawn.share:.2g}"
-        return f"by its side it covers {share} of {tokens}, and as large as they are none fill it"
+        return f"is {share} times as large as {tokens} by its side, and not filled in their size"
     if filled.complete:
         return f"cannot be filled with {tokens}: all ways were tried, {filled.nodes} steps"
     return f"was not filled with {tokens} in {filled.seconds:.1f} s"

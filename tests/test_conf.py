@@ -141,7 +141,9 @@ def test_the_papers_presets_are_what_its_authors_ran(name: str) -> None:
 @pytest.fixture
 def stored(tmp_path: Path) -> Path:
     path = tmp_path / "config.yaml"
-    path.write_text(yaml.safe_dump(compose("train", "agent=mlp", "tokens=pair", "seed=7")))
+    path.write_text(
+        yaml.safe_dump(compose("train", "agent=mlp", "agent.flags=true", "tokens=pair", "seed=7"))
+    )
     return path
 
 

@@ -72,13 +72,13 @@ def answered(name: str, source: str, task: Place) -> "Answer":
     return solving.answer(name, source, layout, task.tokens.scale, solving.SECONDS, method)
 
 
-def read_silhouette(name: str, task: Place) -> Shown:
+def read_silhouette(name: str, source: str, task: Place) -> Shown:
     """A silhouette, and a run's tokens in it; see `answered`.
 
     Raises:
         ConfigError: see there; or the tokens would reach out of the run's arena.
     """
-    source, layout = f"silhouette={name}", task.layout
+    layout = task.layout
     answer = answered(name, source, task)
     lies = answer.lies
     poses = turned_figure(layout, (lies.poses, lies.flipped), 0.0)

@@ -1,5 +1,6 @@
 """What `target=` names: a puzzle, a drawing, a silhouette or a photograph, told apart by itself."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,10 @@ if TYPE_CHECKING:  # needs OpenCV and shapely
     from tangram_vision.solution import Solution
 
 PUZZLE, SILHOUETTE, PHOTOGRAPH = "puzzle", "silhouette", "photograph"
+MOST_PARTS = 3  # of a figure; a picture of more is a photograph
 TOLD = {
-    PUZZLE: "a puzzle, whose pieces are told",
-    SILHOUETTE: "a figure whose pieces are not told",
+    PUZZLE: "a puzzle with its pieces",
+    SILHOUETTE: "a figure without its pieces",
     PHOTOGRAPH: "a photograph of the tokens",
 }
 
@@ -27,7 +29,7 @@ def told_apart(target: str, task: Place) -> str:
     A picture is a photograph if it shows all tokens of the run, three touching at most.
 
     Raises:
-        ConfigError: there is no such file.
+        ConfigError: there is no such file, or it is a photograph that lacks tokens.
     """
     path, source = Path(target), f"target={target}"
     if not path.suffix:
@@ -40,7 +42,10 @@ def told_apart(target: str, task: Place) -> str:
         return SILHOUETTE
     try:
         read_photograph(target, task)
-    except ConfigError:
+    except ConfigError as error:
+        apart = re.search(r"shows (\d+) areas", str(error))
+        if apart and int(apart[1]) > MOST_PARTS:
+            raise ConfigError(f"{error}; or set silhouette={target} if it is one figure") from None
         return SILHOUETTE
     return PHOTOGRAPH
 

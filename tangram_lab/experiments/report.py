@@ -134,8 +134,12 @@ def _curves(
             panel.fill_between(grid, middle - spread, middle + spread, color=colour, alpha=0.15)
         text, linear = AXES[x]
         panel.set(xlabel=text, xlim=(0.0, None))
-        if panel.get_xlim()[1] > 10.0 * linear:  # else its ticks would lie over each other
+        most = panel.get_xlim()[1]
+        if most > 10.0 * linear:
             panel.set_xscale("symlog", linthresh=linear)
+            decades = 10.0 ** np.arange(1, 12)
+            # Those below would lie over each other.
+            panel.set_xticks([0.0, *decades[(decades >= linear) & (decades <= most)]])
         for (name, levels), dash in zip(figure.reported.items(), DASHES, strict=False):
             panel.axhline(levels[0], color="#111827", linestyle=dash, label=name)
         for policy, dash in RIVALS.items():

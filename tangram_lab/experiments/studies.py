@@ -132,7 +132,7 @@ class StudyConfig(Settings):
 
     run_dir: str = field(metadata=declared("folder of all runs; what is there goes on"))
     study: str = setting("paper", "of conf/studies.yaml: paper, token, parts, game, ...")
-    budget: str = setting("laptop", "smoke (minutes), laptop or paper (days)")
+    budget: str = setting("laptop", "smoke (a minute), laptop or paper (hours)")
     seeds: int | None = setting(None, "of every training, at most; null is the budget's", low=1)
     out: str | None = setting(
         None, "folder of STUDY.csv; rows that are there are not made again; null is run_dir"

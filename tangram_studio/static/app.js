@@ -269,7 +269,7 @@ class Studio {
     $("seen-pieces").replaceChildren(...answer.pieces.map((piece, k) => make("polygon", {
       points: piece.map((point) => point.join(",")).join(" "), fill: this.board.tokens[k].colour,
     })));
-    const share = `It shares ${per_cent(answer.iou)} of its area with what you showed, the red dashes.`;
+    const share = `Both share ${per_cent(answer.iou)} of the area of both together; red dashes are what you showed.`;
     $("told").textContent = answer.exact
       ? `What it sees, and where the tans go: ${answer.how}.`
       : `Seven tans do not fill it; this is the nearest figure that was found. ${share} ${answer.how}`;
@@ -392,7 +392,10 @@ class Studio {
     $("draw-clear").addEventListener("click", () => this.source("draw"));
     $("draw-done").addEventListener("click", () => this.fillDrawing());
     $("lay-clear").addEventListener("click", () => {
-      if (this.kind === "solve" && this.solving.answer) this.solving.begin(this.answer);
+      if (this.kind === "solve" && this.solving.answer) {
+        $("answer").hidden = true;
+        this.solving.begin(this.answer);
+      }
       else this.source(this.kind);
     });
     $("hint").addEventListener("click", () => this.solving.hint());
@@ -404,7 +407,10 @@ class Studio {
     });
     const chosen = (act) => () => {
       if (this.board.mode !== "lay") this.say("Start again to lay another figure.");
-      else if (this.board.chosen >= 0) act(this.board.chosen);
+      else if (this.board.chosen >= 0) {
+        act(this.board.chosen);
+        this.board.onDrag(true, true);
+      }
       else this.say("Click a tan first.");
     };
     $("turn-left").addEventListener("click", chosen((k) => this.board.turn(k)));

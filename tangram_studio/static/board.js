@@ -240,11 +240,10 @@ export class Board {
     this.draw();
   }
 
-  corners(k) {
-    const [x, y, angle] = this.poses[k];
+  corners(k, [x, y, angle] = this.poses[k], flipped = this.flipped[k]) {
     const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
     return this.tokens[k].corners.map(([u, v]) => {
-      const w = this.flipped[k] ? -v : v;
+      const w = flipped ? -v : v;
       return [x + cos * u - sin * w, y + sin * u + cos * w];
     });
   }

@@ -1,4 +1,4 @@
-// A person lays a figure: a clock runs, a hint lays one tan, and the agent may race.
+// A person lays a figure: time is taken, a hint lays one tan, and the agent may race.
 
 import { MOVE_MS, pathOf, tray } from "./board.js";
 
@@ -7,6 +7,7 @@ const SOLVED = 0.95; // of the area of both together, as everywhere
 const NEAR = 0.03; // a tan this near to where the answer has it lies there
 const OVER = 0.03; // of the tans' area that may lie on other tans
 
+const CHOOSE = "Choose a figure first.";
 const clock = (ms) => `${Math.floor(ms / 60_000)}:${String(Math.floor(ms / 1000) % 60).padStart(2, "0")}`;
 
 export class Solving {
@@ -45,11 +46,16 @@ export class Solving {
 
   // One tan that does not lie as the answer has it is laid there.
   hint() {
-    if (!this.answer || this.solved) return;
+    if (!this.answer || this.solved) {
+      this.say(this.solved ? "It is solved." : CHOOSE);
+      return;
+    }
     const { poses, flipped } = this.answer.goal;
-    const away = poses.map(([x, y], k) => Math.hypot(x - this.board.poses[k][0], y - this.board.poses[k][1]));
-    const k = away.findIndex((way, i) => way > NEAR && !this.taken(i));
-    if (k < 0) return;
+    const k = poses.findIndex((_, i) => !this.lies(i, i) && !this.taken(i));
+    if (k < 0) {
+      this.say("Every tan lies where one may.");
+      return;
+    }
     this.board.poses[k] = [...poses[k]];
     this.board.flipped[k] = flipped[k];
     this.board.raise(k);
@@ -60,13 +66,23 @@ export class Solving {
 
   // Whether another tan of the shape lies in a tan's place already.
   taken(k) {
-    const [x, y] = this.answer.goal.poses[k];
-    return this.board.tokens.some((token, other) => token.name === this.board.tokens[k].name
-      && Math.hypot(this.board.poses[other][0] - x, this.board.poses[other][1] - y) <= NEAR);
+    const alike = (token) => token.name === this.board.tokens[k].name;
+    return this.board.tokens.some((token, other) => other !== k && alike(token) && this.lies(other, k));
+  }
+
+  // Whether a tan lies in the place of another, or its own: each corner near to one.
+  lies(own, place) {
+    const { poses, flipped } = this.answer.goal;
+    const wanted = this.board.corners(place, poses[place], flipped[place]);
+    return this.board.corners(own).every(([x, y]) =>
+      wanted.some(([u, v]) => Math.hypot(x - u, y - v) <= NEAR));
   }
 
   race() {
-    if (!this.answer) return false;
+    if (!this.answer) {
+      this.say(CHOOSE);
+      return false;
+    }
     this.again();
     this.racing = true;
     this.say("The agent has begun, in the small picture.");
@@ -82,7 +98,9 @@ export class Solving {
       if (!move.over) this.next();
       else if (!this.solved) {
         this.racing = false;
-        this.say(`The agent was first, in ${clock(performance.now() - this.begun)}. Go on, or start again.`);
+        const took = clock(performance.now() - this.begun);
+        const told = move.iou >= SOLVED ? `The agent was first, in ${took}.` : "The agent can do no more.";
+        this.say(`${told} Go on, or start again.`);
       }
     }, move.token === null ? 0 : MOVE_MS);
   }

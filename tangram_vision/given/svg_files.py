@@ -22,8 +22,7 @@ from tangram_sim.puzzles.sketches import read_text
 SIDE = 2400  # pixels of a square that the whole drawing goes into
 SECONDS, BYTES = 10, 2 << 30  # that drawing may take
 _BORDER = SIDE // 8  # around it
-_WIDER = 3  # times as wide is the page on which it is seen whether it was cut off,
-_BEYOND = 1.02  # and more than so many times as much is drawn there
+_SLACK = 3.0  # pixels beyond the page that are none
 _SEEN = 24  # levels of any colour by which a figure differs from its ground
 _REFUSED = {"text": "convert it to paths", "image": "give the picture itself"}
 # As a picture in another one it stays within this size, and reads no other file.
@@ -58,12 +57,9 @@ def read_svg(path: Path, source: str) -> Image.Image:
     shown = pixels[top : low + 1, left : right + 1]
     figure = _figure(shown)
     # A page of another colour than white would be a figure itself.
-    coloured = shown[..., 3].all() and (shown[0, 0, :3] < 256 - _SEEN).any()
-    wider = None if coloured else _wider(root)
-    if wider is not None:
-        beyond = np.count_nonzero(_figure(_drawn(wider, source)))
-        if beyond * _WIDER**2 > _BEYOND * np.count_nonzero(figure):
-            raise ConfigError(f"{source} is cut off: it reaches out of its viewBox, enlarge that")
+    page = max(shown.shape[:2]) >= SIDE - 1 and shown[..., 3].all()
+    if not (page and (shown[0, 0, :3] < 256 - _SEEN).any()) and _reaches_out(root, source):
+        raise ConfigError(f"{source} is cut off: it reaches out of its viewBox, enlarge that")
     return Image.fromarray(np.where(np.pad(figure, _BORDER), 0, 255).astype(np.uint8))
 
 
@@ -103,28 +99,31 @@ def _drawn(text: str, source: str) -> AnyArray:
     return drawn
 
 
-def _wider(root: ET.Element) -> str | None:
-    """The same drawing with room around its page, without a rectangle that covers the page.
+def _reaches_out(root: ET.Element, source: str) -> bool:
+    """Whether something is drawn beyond the page, without a rectangle that covers the page.
 
-    None where the page is not told in numbers, or where something is sized by it.
+    Not known, so no, where the page is not told in numbers or something is sized by it.
     """
     try:
         page = [float(one) for one in re.split(r"[\s,]+", (root.get("viewBox") or "").strip())]
         x, y, width, height = page
     except ValueError:
-        return None
+        return False
     for parent in root.iter():
         for child in [one for one in parent if one.get("width") == one.get("height") == "100%"]:
             parent.remove(child)
     if any("%" in value for one in root.iter() for value in one.attrib.values() if one is not root):
-        return None
-    more = (_WIDER - 1) / 2
-    root.set(
-        "viewBox", f"{x - more * width} {y - more * height} {_WIDER * width} {_WIDER * height}"
-    )
-    for name in ("width", "height"):
+        return False
+    for name in ("width", "height", "preserveAspectRatio"):
         root.attrib.pop(name, None)
-    return ET.tostring(root, encoding="unicode")
+    root.set("viewBox", f"{x - width} {y - height} {3.0 * width} {3.0 * height}")
+    drawn = _figure(_drawn(ET.tostring(root, encoding="unicode"), source))
+    pixels = SIDE / (3.0 * max(width, height))
+    for axis, length in ((0, width), (1, height)):
+        ink = np.flatnonzero(drawn.any(axis=axis)) + 0.5 - SIDE / 2.0
+        if len(ink) and np.abs(ink).max() > length * pixels / 2.0 + _SLACK:
+            return True
+    return False
 
 
 def _checked(text: str, source: str) -> ET.Element:

@@ -186,10 +186,18 @@ FUTURE = [{"strategy": "future"}]
     [
         (SEVERAL, {"reward": {"name": "dense"}}, "reward.name=dense changes nothing with 2 tokens"),
         (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
-        (SEVERAL, {"reward": {"name": "dense"}}, "set agent=paper, which values the"),
-        (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 .*agent=paper, which values the"),
+        (
+            SEVERAL,
+            {"reward": {"name": "dense"}},
+            "set agent=paper agent.flags=true, which values the",
+        ),
+        (
+            SEVERAL,
+            {"agent": {"gamma": 0.9}},
+            "agent.gamma=0.9 .*agent=paper agent.flags=true, which values the",
+        ),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
-        (ONE, {"agent": {"kind": "scene", "reapply": 0}}, "no setting agent.reapply: delete it"),
+        (ONE, {"agent": {"kind": "scene", "reapply": 0}}, "no setting agent.reapply: "),
         (ONE, {"agent": {"polyak": 0.9}}, "agent.polyak=0.9 changes nothing with agent.gamma=0"),
         (
             ONE,

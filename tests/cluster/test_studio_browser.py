@@ -641,14 +641,17 @@ def test_a_person_lays_a_figure_and_is_told_that_it_is_solved(page: Page) -> Non
     )
     page.evaluate(
         """([k, angle, flipped]) => {
-            studio.board.poses[k][2] = angle;
+            studio.board.poses[k][2] = angle - Math.PI / 4;
             studio.board.flipped[k] = flipped;
             studio.board.draw();
         }""",
         [k, angle, flipped],
     )
     here = page.evaluate("k => studio.board.poses[k].slice(0, 2)", k)
-    drag(page, [tuple(here), (x + 0.02, y - 0.02)])
+    drag(page, [tuple(here), (x, y)])
+    page.evaluate("([k, x, y]) => { studio.board.move_to(k, x, y); }", [k, x, y])
+    expect(page.locator("#numbers")).to_be_hidden()
+    page.locator("#turn-left").click()
     status(page).to_have_text(re.compile(r"^Solved! It took you \d:\d\d\.$"))
     expect(page.locator("#numbers")).to_contain_text("Details")
     shot(page, "solved")

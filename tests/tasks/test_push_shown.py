@@ -233,7 +233,9 @@ def test_without_a_figure_a_task_without_a_plan_writes_none(tmp_path: Path) -> N
     told = ("run_dir=pretrained/square", f"out={tmp_path / 'x.json'}")
     status, _, err = here("tangram-play", *told, cwd=tmp_path)
     assert (status, list(tmp_path.iterdir())) == (2, [])
-    assert "x.json is for where tokens lie in a figure, or a finger's way: add target=cat" in err
+    assert (
+        "x.json is for where tokens lie in a figure, or a finger's way: name the figure by" in err
+    )
 
 
 def test_an_arm_that_never_pushed_is_filmed_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:

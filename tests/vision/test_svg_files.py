@@ -18,6 +18,7 @@ TRIANGLE = [(10, 10), (110, 10), (10, 110)]
 SQUARE = [(10, 10), (110, 10), (110, 110), (10, 110)]
 OTHER = [(230, 70), (230, 170), (130, 170)]
 MIB = 2**20
+XMLNS = 'xmlns="http://www.w3.org/2000/svg"'
 
 
 def read(folder: Path, content: str) -> np.ndarray:
@@ -99,6 +100,9 @@ def test_what_reaches_out_of_its_page_is_cut_off(tmp_path: Path, ground: str) ->
         return read(tmp_path, f'{HEAD}{ground}<polygon points="9,9 {right},9 {right},300"/></svg>')
 
     assert (drawn(300) < 128).any()  # to the page's very edge
+    for page in ('width="400" height="300"', 'width="300" preserveAspectRatio="none" height="90"'):
+        thin = '<path d="M20 20H80V80H20Z" fill="none" stroke="#000" stroke-width="0.4"/>'
+        assert (read(tmp_path, f'<svg {XMLNS} viewBox="0 0 100 100" {page}>{thin}</svg>') < 1).any()
     with pytest.raises(ConfigError, match="is cut off: it reaches out of its viewBox, enlarge"):
         drawn(400)
 

@@ -41,7 +41,7 @@ class Pair(TokenAgent):
 
     def _check_credit(self, task: Place, several: str) -> None:
         """Refuse what several tokens on pairs cannot use, or cannot learn."""
-        whole = "set agent=paper, which values the whole scene"
+        whole = "set agent=paper agent.flags=true, which values the whole scene"
         if self.config.gamma > 0.0:
             refuse_ignored(f"agent.gamma={told(self.config.gamma)}", several, whole)
         for own in fields(RewardConfig):

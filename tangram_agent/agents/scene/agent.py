@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 from tangram_agent.base.agent import TokenAgent, seen_tokens
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
+from tangram_core.errors import ConfigError
 from tangram_core.settings import LEARNING, NETWORK, setting
 from tangram_core.task import Task
 from tangram_tasks.place import Place
@@ -45,9 +46,14 @@ class Scene(TokenAgent):
     config: SceneConfig
 
     def check(self, task: Task) -> None:
-        """It plays tokens whose target is seen."""
-        seen_tokens(task, "scene")
+        """It plays tokens whose target is seen; of several it must be told which are placed."""
+        place = seen_tokens(task, "scene")
         super().check(task)
+        if place.layout.tokens > 1 and not self.config.flags:
+            raise ConfigError(
+                f"agent.flags=false with {place.layout.tokens} tokens tells nobody which one is to "
+                "move: set agent.flags=true"
+            )
 
     def actor(self, task: Task) -> "SceneActor":
         """See `Agent.actor`."""

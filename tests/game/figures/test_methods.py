@@ -58,7 +58,7 @@ def test_it_is_told_who_filled_what(
     task = load_run("pretrained/tangram7").task
     method = replace(together(task.layout), search=searches)
     monkeypatch.setattr("tangram_game.figures.methods.together", lambda _: method)
-    shown = read_silhouette("swan", task)
+    shown = read_silhouette("swan", "it", task)
     assert shown.exact
     assert shown.told.startswith(f"filled by the {by} in ")
 

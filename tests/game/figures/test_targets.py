@@ -126,6 +126,12 @@ def test_data_are_of_a_figure_or_of_a_finger(tmp_path: Path) -> None:
             _play(composed("play", [*given, out]))
 
 
+def test_a_hand_takes_figures_of_the_library_alone(tmp_path: Path) -> None:
+    given = ["run_dir=pretrained/hand", "target=cat", f"out={tmp_path}/plan.json"]
+    with pytest.raises(ConfigError, match=r"plays task=push, .*: set puzzle=cat, or leave run_dir"):
+        _play(composed("play", given))
+
+
 @pytest.mark.parametrize("target", ["cat", "boat.png", "photograph.jpg"])
 def test_a_target_is_played_whatever_it_is(
     target: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -34,7 +34,7 @@ def outline(path: Path, *rings: Any, **more: Any) -> str:
 
 def near(name: str, least: float) -> str:
     """What is told of a figure that nothing fills, and that comes so near."""
-    shown = read_silhouette(name, load_run("pretrained/tangram7").task)
+    shown = read_silhouette(name, name, load_run("pretrained/tangram7").task)
     assert not shown.exact
     why, _, how = shown.told.partition("; ")
     assert float(how.removeprefix("the nearest figure has IoU ").removesuffix(" with it")) > least
@@ -60,12 +60,12 @@ def test_so_is_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_so_is_one_that_tells_another_size(tmp_path: Path) -> None:
     wide = outline(tmp_path / "it.json", STRIP, side=1.25)
-    assert "by its side it covers 0.63 of the seven tans, and as large as they" in near(wide, 0.5)
+    assert "is 0.63 times as large as the seven tans by its side, and not filled" in near(wide, 0.5)
 
 
 def test_a_wrong_size_is_no_matter_where_tans_fill_the_figure(tmp_path: Path) -> None:
     large = outline(tmp_path / "it.json", SQUARE, side=0.5)
-    shown = read_silhouette(large, load_run("pretrained/tangram7").task)
+    shown = read_silhouette(large, large, load_run("pretrained/tangram7").task)
     assert shown.exact
 
 

@@ -275,7 +275,7 @@ def test_a_missing_engine_is_named_also_before_a_world_is_made(
 def test_silhouettes_are_shown_to_who_knows_outlines() -> None:
     """A master asks before it starts, an environment when it is made."""
     shown = SimConfig(backend="kinematic", observe="silhouette")
-    reason = "^sim.observe=silhouette is for an agent of outlines: .*corners$"
+    reason = "^sim.observe=silhouette is for an agent of outlines: .*set sim.observe=corners"
     with pytest.raises(ConfigError, match=reason):
         check_shown(shown, outlines=False)
     with pytest.raises(ConfigError, match=reason):
