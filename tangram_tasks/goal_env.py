@@ -176,9 +176,11 @@ def place(
     """Tokens that are moved onto their target.
 
     Args:
-        shapes, scale: of the tokens, see `TokensConfig`; the default makes the square's side 0.4.
+        shapes: of the tokens, see `TokensConfig`.
+        scale: of them; the default makes the square's side 0.4.
         reward: the name of a reward.
-        render_mode, render_size: see `TaskEnv`.
+        render_mode: see `TaskEnv`.
+        render_size: see there.
         **sim: the fields of `SimConfig`, such as backend="kinematic".
     """
     world = from_mapping(SimConfig, sim, "sim")
