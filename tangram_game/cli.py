@@ -53,7 +53,7 @@ def _play(settings: Plain) -> int:
     _check_drawings(config)
     stored = _check_played(config)
     _check_data(config, stored)
-    name = "silhouette" if config.target is None else "target"
+    name = "target" if config.target else "silhouette"
     if config.target is not None or config.data:
         recognised = _recognised(config, stored)
         if recognised is None:
@@ -113,7 +113,7 @@ def _recognised(config: "PlayConfig", stored: "Run") -> "PlayConfig | None":
     if config.data:
         from tangram_core.store.files import write_whole
 
-        source = f"{'silhouette' if config.target is None else 'target'}={figure}"
+        source = f"{'target' if config.target else 'silhouette'}={figure}"
         solution = targets.solved(figure, source, stored.task, kind)
         as_json = Path(config.out).suffix == ".json"
         write_whole(Path(config.out), solution.json() if as_json else solution.svg())

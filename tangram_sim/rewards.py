@@ -21,9 +21,8 @@ from tangram_sim.sight.pictures import token_pixels
 
 MAX_REWARD = 1e6  # of a user's own function
 LEAST_SHOWN = 16  # pixels that a token covers at least where Eq. 14 is measured on pictures
-SHARPNESS = (
-    200.0 * 2.0**0.5
-)  # s: how steep the logarithm is near the target; the authors' 2.83 / .01
+# s: how steep the logarithm is near the target; the authors' 2.83 / .01.
+SHARPNESS = 200.0 * 2.0**0.5
 RewardFn = Callable[[Floats, Floats], Floats]
 UserReward = Callable[[Floats, Floats, Layout], Any]
 

@@ -3,19 +3,15 @@
 `solution.schema.json` beside this file is for programs that check files.
 """
 
-from inspect import cleandoc
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
 
 from tangram_core.arrays import Floats
-from tangram_core.errors import ConfigError
 from tangram_sim.drawing.strokes import colour_of
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.puzzles.sketches import read_text
 
 Point = tuple[float, float]
 Kind = Literal["filled", "nearest", "seen"]
@@ -95,14 +91,6 @@ class Solution(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return "\n".join([*lines, "</svg>", ""]).encode()
 
 
-def schema() -> dict[str, Any]:
-    """The JSON schema of a file, as `solution.schema.json` has it."""
-    found = msgspec.json.schema(Solution)
-    for one in found["$defs"].values():
-        one["description"] = cleandoc(one["description"])
-    return found
-
-
 def tokens_of(layout: Layout, scale: float, lies: Dissection, pixels: Floats) -> list[Token]:
     """Tokens as they lie, the larger ones first.
 
@@ -128,18 +116,6 @@ def tokens_of(layout: Layout, scale: float, lies: Dissection, pixels: Floats) ->
         )
         for order, k in enumerate(np.argsort(-layout.areas, kind="stable").tolist(), 1)
     ]
-
-
-def read_solution(path: Path) -> Solution:
-    """A file that `Solution.json` wrote.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    try:
-        return msgspec.json.decode(read_text(path, str(path)), type=Solution)
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"{path} is no solution: {error}") from None
 
 
 def _points(values: Floats) -> list[Point]:

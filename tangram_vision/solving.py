@@ -4,8 +4,7 @@ import time
 from dataclasses import dataclass
 
 from tangram_sim.geometry.dissections import Dissection
-from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
-from tangram_sim.puzzles.assembly import COUNTS
+from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.targets import has_all_tans
 from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
 from tangram_vision.silhouettes.approximations import nearest_figure
@@ -47,13 +46,6 @@ class Answer:
             picture=Picture(*self.drawn.picture.size),
             tokens=tokens_of(layout, scale, self.lies, self.drawn.corners(layout, self.lies)),
         )
-
-
-def solve(path: str, seconds: float = SECONDS) -> Solution:
-    """Where the seven tans lie in a figure; see `tangram_vision.solve`."""
-    shapes = tuple(name for name, count in COUNTS.items() for _ in range(count))
-    layout = make_layout(TokensConfig(shapes, 1.0))
-    return answer(path, path, layout, 1.0, seconds).solution(layout, 1.0, path)
 
 
 def answer(

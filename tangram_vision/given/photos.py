@@ -44,6 +44,18 @@ _NOTHING = "no token alone"
 _GROUND, _TOKEN = 230, 60  # levels of the picture that is looked at
 
 
+class LackingError(ConfigError):
+    """Not all tokens were found.
+
+    Attributes:
+        areas: that were seen apart.
+    """
+
+    def __init__(self, told: str, areas: int) -> None:
+        super().__init__(told)
+        self.areas = areas
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """Tokens in a photograph.
@@ -84,7 +96,8 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
     view = len(part) / unit
     seen = None if len(spots.boxes) > layout.tokens else _seen(part, layout, view)
     if seen is None:
-        raise ConfigError(f"{source} {_told(_smaller(part, _PIXELS[-1]), spots, layout, view)}")
+        told = _told(_smaller(part, _PIXELS[-1]), spots, layout, view)
+        raise LackingError(f"{source} {told}", len(spots.boxes))
     middle = np.array([corner[0] + len(part) / 2.0, -corner[1] - len(part) / 2.0]) / unit
     return Found(seen.poses + (*middle, 0.0), seen.flipped, unit)
 

@@ -197,6 +197,11 @@ FUTURE = [{"strategy": "future"}]
             "agent.gamma=0.9 .*agent=paper agent.flags=true, which values the",
         ),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
+        (
+            SEVERAL,
+            {"agent": {"kind": "scene", "flags": False}},
+            "flags=false with 2 tokens",
+        ),
         (ONE, {"agent": {"kind": "scene", "reapply": 0}}, "no setting agent.reapply: "),
         (ONE, {"agent": {"polyak": 0.9}}, "agent.polyak=0.9 changes nothing with agent.gamma=0"),
         (

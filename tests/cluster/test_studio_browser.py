@@ -14,13 +14,14 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from tangram_sim.puzzles.assembly import PuzzleRules
 from tangram_sim.puzzles.figures import read_puzzles
-from tangram_vision.solution import read_solution
+from tangram_vision.solution import Solution
 from tests.cluster.studios import Running, studio
 from tests.conftest import NO_BROWSER
 
@@ -668,6 +669,10 @@ def test_the_agent_races(page: Page) -> None:
     expect(pieces).to_have_count(0)
     expect(pieces).to_have_count(7)
     status(page).to_have_text(re.compile(r"^The agent was first, in 0:\d\d\."))
+    page.evaluate(
+        "studio.solving.race(); studio.solving.raced({ token: null, over: true, iou: 0.4 })"
+    )
+    status(page).to_have_text(re.compile(r"^The agent can do no more\."))
     assert page.evaluate("studio.board.poses[0][1]") == pytest.approx(0.7)  # the person's own lie
 
 
@@ -677,7 +682,7 @@ def test_an_answer_is_saved_as_data(page: Page, tmp_path: Path) -> None:
     with page.expect_download() as caught:
         page.locator("#save-solution").click()
     caught.value.save_as(tmp_path / "it.json")
-    found = read_solution(tmp_path / "it.json")
+    found = msgspec.json.decode((tmp_path / "it.json").read_bytes(), type=Solution)
     assert (found.kind, len(found.tokens), found.source) == ("filled", 7, "puzzle")
 
 

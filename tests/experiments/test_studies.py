@@ -1,6 +1,7 @@
 """The file of studies, the rows that its runs leave, and what is drawn of them."""
 
 import json
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -159,6 +160,8 @@ def test_every_setting_of_every_study_is_known(budget: str) -> None:
     for name in known.studies:
         for job in jobs_of(StudyConfig(run_dir="x", study=name, budget=budget), known):
             wrong += unknown(["tangram-train", *job.told])
+            bounds = {one for one in job.told if re.fullmatch(r"max_\w+=[1-9]\d*", one)}
+            wrong += [] if bounds else [f"{name}, {job.name} never ends"]
             for told in job.tests.values():
                 wrong += [one for one in told if unknown(["tangram-eval", one])]
     assert wrong == []

@@ -41,10 +41,10 @@ class SceneActor(NetworkActor):
         """Velocities (B, 3) with noise, before the last tanh or after it; some are uniform."""
         config, rows = self._config, []
         for own, before, generator in zip(velocity, raw, explore, strict=True):
-            uniform = generator.random() < config.uniform_share
-            drawn = generator.uniform(-1.0, 1.0, 3) if uniform else generator.standard_normal(3)
-            noise = config.noise * drawn
-            noisy = np.tanh(before + noise) if config.noise_inside else own + noise
-            rows.append(drawn if uniform else noisy)
+            if generator.random() < config.uniform_share:
+                rows.append(generator.uniform(-1.0, 1.0, 3))
+                continue
+            noise = config.noise * generator.standard_normal(3)
+            rows.append(np.tanh(before + noise) if config.noise_inside else own + noise)
         explored: Singles = np.clip(np.stack(rows), -1.0, 1.0).astype(np.float32)
         return explored
