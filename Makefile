@@ -106,7 +106,7 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@touch .venv/.installed-run $@
 
 .venv/.installed-dev: pyproject.toml lock.txt
-	@.ci/install .venv dev,docs,peers,studio,video
+	@.ci/install .venv dev,docs,onnx,peers,studio,video
 	@touch .venv/.installed-run .venv/.installed-docs .venv/.installed-studio $@
 
 .venv/.installed-browser: .venv/.installed-dev

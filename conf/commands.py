@@ -267,6 +267,21 @@ out=solution.json or .svg it writes where each token lies.""",
         ("tangram_game.config:PlayConfig",),
         over=OVER,
     ),
+    "export": Command(
+        "tangram-export",
+        """\
+Writes an agent as an ONNX file, which onnxruntime plays in any language without torch: an action
+of the fields that the task shows, by their names, for any number of rows. It plays 1,000
+observations both ways first, and writes nothing if they are more than 1e-5 apart. Needs the extra
+onnx; agents that search (outline, push) are more than a network and are refused.""",
+        (
+            "tangram-export run_dir=runs/my_run out=agent.onnx",
+            "tangram-export run_dir=pretrained/tangram7 out=runs/tangram7.onnx",
+            "tangram-export run_dir=runs/my_run agent.reapply=0    # fewer steps, a smaller file",
+        ),
+        ("tangram_game.config:ExportConfig",),
+        over=("agent",),
+    ),
     "studio": Command(
         "tangram-studio",
         """\

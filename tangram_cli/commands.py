@@ -59,6 +59,7 @@ worker = partial(run, "worker.cli", "worker")
 status = partial(run, "worker.cli", "status")
 evaluate = partial(run, "tangram_game.cli", "evaluate")
 play = partial(run, "tangram_game.cli", "play")
+export = partial(run, "tangram_game.cli", "export")
 studio = partial(run, "tangram_studio.cli", "studio")
 experiment = partial(run, "tangram_lab.experiments.cli", "experiment")
 report = partial(run, "tangram_lab.experiments.cli", "report")
@@ -72,6 +73,7 @@ COMMANDS: dict[str, Callable[[], int]] = {
     "status": status,
     "eval": evaluate,
     "play": play,
+    "export": export,
     "studio": studio,
     "experiment": experiment,
     "report": report,

@@ -6,12 +6,12 @@ Legend: E episodes, B environments, T steps of an episode, A entries of an actio
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from tangram_core.arrays import Singles
-from tangram_core.errors import RunError
+from tangram_core.errors import ConfigError, RunError
 from tangram_core.settings import Settings
 from tangram_core.spec import Array, Arrays, Episodes
 from tangram_core.task import Generators, History, Json, Task
@@ -84,6 +84,21 @@ class Actor(ABC):
                 environment comes from its own, so that it plays alike whoever plays beside it.
                 None: as well as it can.
         """
+
+    def graph(self) -> Any:
+        """All of `act` without exploring as one network, for whoever plays it without torch.
+
+        Returns:
+            A torch.nn.Module. Its `forward` takes the task's fields by name, (B, *shape) float32,
+            and gives actions (B, A).
+
+        Raises:
+            ConfigError: it is more than a network, as a search is.
+        """
+        raise ConfigError(
+            f"a {type(self).__name__} decides by a search, which is no network: play it by "
+            "tangram_agent.runs.load_run, as docs/inference.md has it"
+        )
 
 
 class Learner(ABC):

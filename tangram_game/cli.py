@@ -1,4 +1,4 @@
-"""The commands tangram-eval and tangram-play.
+"""The commands tangram-eval, tangram-play and tangram-export.
 
 Everything heavy is imported after the config was composed, so --help and wrong input are
 instant.
@@ -23,6 +23,11 @@ def evaluate() -> int:
 def play() -> int:
     """tangram-play: draws a finished run at play."""
     return entry("play", _play)
+
+
+def export() -> int:
+    """tangram-export: writes an agent as ONNX."""
+    return entry("export", _export)
 
 
 def _evaluate(settings: Plain) -> int:
@@ -69,6 +74,19 @@ def _play(settings: Plain) -> int:
     from tangram_game.play import play_run
 
     return play_run(config, filled)
+
+
+def _export(settings: Plain) -> int:
+    from tangram_core.setup import from_mapping
+    from tangram_core.store.files import check_writable
+    from tangram_game.config import ExportConfig
+
+    config = from_mapping(ExportConfig, with_changes(with_absolute_paths(settings)))
+    check_writable("out", Path(config.out))
+    tell(f"writes {config.run_dir} down, for a minute, and plays it to compare")
+    from tangram_game.export import export_run
+
+    return export_run(config)
 
 
 def _check_data(config: "PlayConfig", stored: "Run") -> None:

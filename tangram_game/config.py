@@ -211,3 +211,26 @@ class PlayConfig(Settings):
     def run(self) -> str:
         """The run to show."""
         return self.run_dir or game_run()
+
+
+@dataclass(frozen=True)
+class ExportConfig(Settings):
+    """An agent as a file that plays without torch (tangram-export).
+
+    Attributes:
+        changes: settings of the agent that are not to be as the run was trained with.
+    """
+
+    run_dir: str = setting("???", "folder of the run, or pretrained/NAME")
+    out: str = setting("runs/agent.onnx", "the file")
+    changes: Changes = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_folder("run_dir", self.run_dir)
+        super().__post_init__()
+        _check_out(self.out)
+        lacking = [name for name in ("onnx", "onnxscript", "onnxruntime") if not find_spec(name)]
+        if lacking:
+            raise ConfigError(
+                f"tangram-export needs {', '.join(lacking)}: pip install {' '.join(lacking)}"
+            )

@@ -4,16 +4,20 @@ Legend: E episodes, B environments, T steps of an episode, K tokens, V corners, 
 action.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from tangram_core import task
 from tangram_core.arrays import Bools, Floats, Pixels
-from tangram_core.spec import Array, Arrays, Episodes
+from tangram_core.spec import Arrays, Episodes
+
+Fields = TypeVar("Fields")  # arrays or tensors
 
 
-def closed(seen: Arrays) -> Array:
+def closed(seen: Mapping[str, Fields]) -> Fields:
     """(B, K) tokens that no action should name: placed, or not seen while others are."""
     return seen.get("closed", seen["placed"])
 

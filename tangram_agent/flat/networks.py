@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.flat.config import BaseConfig
-from tangram_agent.nets.networks import perceptron
+from tangram_agent.nets.networks import perceptron, untraced
 
 
 class Policy(nn.Module):
@@ -24,6 +24,7 @@ class Policy(nn.Module):
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B, A) in [-1, 1] of rows (B, F)."""
+        untraced()
         return torch.tanh(self.layers(rows))
 
     def explore(self, rows: Tensor, normals: Tensor) -> Tensor:

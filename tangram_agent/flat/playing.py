@@ -3,10 +3,11 @@
 Legend: B environments, F entries of a row, A entries of an action.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from tangram_agent.flat.inputs import Inputs, normalised
 from tangram_agent.flat.networks import Policy
@@ -18,6 +19,25 @@ from tangram_core.spec import Arrays
 from tangram_core.task import Generators, History
 
 MEAN, SCALE, POLICY = "mean", "scale", "policy."
+
+
+class Decision(nn.Module):
+    """Actions (B, A) of the task's fields, by name, exploration off."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, policy: Policy, names: Sequence[str], mean: Singles, scale: Singles) -> None:
+        super().__init__()
+        self.policy, self._names = policy, names
+        self.register_buffer("mean", torch.from_numpy(mean), persistent=False)
+        self.register_buffer("scale", torch.from_numpy(scale), persistent=False)
+
+    def forward(self, seen: Mapping[str, Tensor]) -> Tensor:
+        """Of fields (B, ...)."""
+        rows = torch.cat([seen[name].flatten(1) for name in self._names], dim=1)
+        actions: Tensor = self.policy(normalised(rows, self.mean, self.scale))
+        return actions
 
 
 class PolicyActor(Actor):
@@ -48,6 +68,10 @@ class PolicyActor(Actor):
             raise RunError("damaged weights: the statistics must be finite, with positive scales")
         load_arrays(self._policy, under(POLICY, dict(weights)))
         self._mean, self._scale = np.array(weights[MEAN]), np.array(weights[SCALE])
+
+    def graph(self) -> "Decision":
+        """The policy behind its normaliser."""
+        return Decision(self._policy, self._inputs.names, self._mean, self._scale)
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
         """What the policy does; where it explores, with noise, or now and then something else."""

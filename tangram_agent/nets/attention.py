@@ -51,7 +51,7 @@ class GraphAttention(nn.Module):
         query, key, value = stacked.unbind()
         if edges.ndim == 3:
             edges = edges.repeat_interleave(self.heads, dim=0)
-        apart = torch.where(edges, 0.0, NO_EDGE).expand(len(query), -1, -1)
+        apart = (NO_EDGE * ~edges).expand(query.shape[0], -1, -1)
         scores = torch.baddbmm(apart, query, key.transpose(1, 2), alpha=self.scale)
         messages = softmax_mean(scores, value) * edges.any(dim=-1, keepdim=True)
         heads = messages.view(size, self.heads, count, self.key_width)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from tangram_agent.base.config import NetConfig
 from tangram_agent.nets.attention import GraphEncoder
 from tangram_agent.nets.graph import Graph
+from tangram_core.errors import ConfigError
 
 VELOCITY = 3
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -62,16 +63,20 @@ class Head(nn.Module):
         """(M, outputs) of views, with an action (M, action) for a head that takes one.
 
         Features, by `see`, may be handed in where they were made before.
+
+        Raises:
+            ConfigError: see `untraced`.
         """
+        untraced()
         seen = self.see(view) if features is None else features
         base = self.graph.base_node(view)
-        rows = torch.arange(len(seen), device=seen.device)
+        rows = torch.arange(seen.shape[0], device=seen.device)
         outputs: Tensor
         if not self.attends:
             outputs = self.layers(seen if action is None else torch.cat([seen, action], dim=-1))
             if not self.at_base or self.graph.tokens == 1:
                 return outputs
-            groups = outputs.view(len(seen), self.graph.tokens, -1)
+            groups = outputs.view(seen.shape[0], self.graph.tokens, -1)
             return groups[rows, base - self.graph.corners]
         if action is not None:
             # Other nodes than the base carry zeros there.
@@ -89,6 +94,18 @@ class Head(nn.Module):
         """What the layers take of views: features of nodes (M, N, F), or one row for each."""
         seen = self.graph.node_features if self.attends else self.graph.vectors
         return seen(view)
+
+
+def untraced() -> None:
+    """Refuse to be traced: a trace keeps what hangs on the one scene that it was made of.
+
+    Raises:
+        ConfigError: torch.jit.trace is at work.
+    """
+    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+        raise ConfigError(
+            "torch.jit.trace would fix one scene for all: tangram-export writes an agent down"
+        )
 
 
 def perceptron(

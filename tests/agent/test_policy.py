@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import SyncVectorEnv
 
 from tangram_agent.agents.pair.actor import critic_plays
@@ -153,14 +154,15 @@ def test_an_action_says_what_was_chosen(flip: bool) -> None:
     count = 40
     policy, scene = policy_of(made), scene_of(transitions(made, count))
     actions = policy.act(*scene)
-    exact = [part.astype(np.float64) for part in scene]
-    choice = policy.actor._planner.choose(exact[0], exact[1] > 0, exact[2])
+    exact = [torch.from_numpy(part.astype(np.float64)) for part in scene]
+    with torch.no_grad():
+        token, turned, velocity = (one.numpy() for one in policy.actor.graph().planner(*exact))
     assert actions.shape == (count, 4 + flip)
     assert actions.dtype == np.float32
-    np.testing.assert_array_equal(chosen_tokens(actions, 7), choice.token)
-    np.testing.assert_array_equal(flips(actions, made.task.layout, made.task.sim), choice.flip)
-    assert choice.flip.any() == flip
-    command = choice.velocity * full_scale(made.task.sim)
+    np.testing.assert_array_equal(chosen_tokens(actions, 7), token)
+    np.testing.assert_array_equal(flips(actions, made.task.layout, made.task.sim), turned)
+    assert turned.any() == flip
+    command = velocity * full_scale(made.task.sim)
     np.testing.assert_allclose(velocities(actions, made.task.sim), command, atol=1e-5)
     # By the shorter turn: no entry is cut off.
     assert np.abs(actions).max() <= 1.0

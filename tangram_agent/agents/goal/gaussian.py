@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 
 from tangram_agent.flat.config import BaseConfig
 from tangram_agent.flat.networks import Policy
-from tangram_agent.nets.networks import perceptron
+from tangram_agent.nets.networks import perceptron, untraced
 
 LOWEST, HIGHEST = -5.0, 2.0  # of the logarithm of a deviation
 
@@ -25,6 +25,7 @@ class GaussianPolicy(Policy):
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B, A) the mean's action."""
+        untraced()
         return torch.tanh(self.layers(rows)[:, : self.actions])
 
     def explore(self, rows: Tensor, normals: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from tangram_agent.agents.outline.filling import UNUSED, Rests
 from tangram_agent.base.config import NetConfig
 from tangram_agent.nets.attention import GraphEncoder
+from tangram_agent.nets.networks import untraced
 
 _OWN = 13  # features of a corner, without the tokens that are left
 _FAR = 1e4
@@ -50,6 +51,7 @@ class OutlineValue(nn.Module):
 
     def forward(self, corners: Corners) -> Tensor:
         """(n,) logits, the same for every state without corners."""
+        untraced()
         used = corners.part != UNUSED
         edges = used[:, None, :] & used[:, :, None]
         nodes, _ = self.encoder(features(corners), edges)

@@ -3,20 +3,37 @@
 Legend: B environments, K tokens, A entries of an action.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
+import torch
+from torch import Tensor, nn
 
 from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.planning import Planner
-from tangram_agent.base.acting import NetworkActor
+from tangram_agent.base.acting import NetworkActor, as_actions
 from tangram_agent.base.config import NetConfig
-from tangram_agent.base.types import Choice
 from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
 from tangram_sim.motion.actions import make_actions, velocities_of
 from tangram_tasks.place import Place
 from tangram_tasks.played import closed
+
+
+class Decision(nn.Module):
+    """Actions (B, A) of the task's fields, by name, exploration off."""
+
+    def __init__(self, task: Place, planner: Planner) -> None:
+        super().__init__()
+        self._task, self.planner = task, planner
+
+    def forward(self, seen: Mapping[str, Tensor]) -> Tensor:
+        """Of fields (B, ...), as `Place.spec` names them."""
+        corners, goals = seen["corners"].double(), seen["goals"].double()
+        token, flip, velocity = self.planner(corners, closed(seen), goals)
+        return as_actions(token, flip, velocity, self._task)
 
 
 class PairActor(NetworkActor):
@@ -27,7 +44,7 @@ class PairActor(NetworkActor):
         super().__init__(networks)
         self._task, self._config = task, config
         self._critic_plays = critic_plays(task)
-        self._planner = Planner(networks, task, config.reapply)
+        self._decides = Decision(task, Planner(networks, task, config.reapply))
 
     def needs(self, name: str) -> bool:
         """Not the critic, where there is one proposal and nothing to choose."""
@@ -35,9 +52,12 @@ class PairActor(NetworkActor):
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
         """Actions (B, A), noisy or anything at all where it explores."""
-        corners, goals = (np.asarray(seen[name], np.float64) for name in ("corners", "goals"))
-        flags = np.asarray(closed(seen), np.bool_)
-        actions = self._actions(self._planner.choose(corners, flags, goals))
+        corners, goals = (np.array(seen[name], np.float64) for name in ("corners", "goals"))
+        flags = np.array(closed(seen), np.bool_)
+        shown = {"corners": corners, "placed": flags, "goals": goals}
+        with torch.no_grad():
+            played = self._decides({name: torch.from_numpy(one) for name, one in shown.items()})
+        actions: Singles = played.numpy()
         if explore is None:
             return actions
         for i, (action, generator) in enumerate(zip(actions, explore, strict=True)):
@@ -48,10 +68,9 @@ class PairActor(NetworkActor):
                 action[-3:] += self._config.noise * generator.standard_normal(3)
         return np.clip(actions, -1.0, 1.0)
 
-    def _actions(self, choice: Choice) -> Singles:
-        """Actions (B, A) of what is chosen."""
-        count, sim = self._task.layout.tokens, self._task.sim
-        return make_actions(choice.token, choice.velocity, choice.flip, count, sim)
+    def graph(self) -> "Decision":
+        """The planner is one network."""
+        return self._decides
 
     def _anything(self, here: Floats, flags: Array, generator: np.random.Generator) -> Singles:
         """An action (A,): any token that is left goes to any pose in the arena, on any side.
@@ -68,7 +87,8 @@ class PairActor(NetworkActor):
         flip = sim.allow_flip and generator.choice((-1.0, 1.0)) > 0.0
         way = velocities_of(wanted[None] - here[None, token], sim).astype(np.float32)
         velocity = np.clip(way, -1.0, 1.0)
-        action: Singles = self._actions(Choice(np.array([token]), np.array([flip]), velocity))[0]
+        count = self._task.layout.tokens
+        action: Singles = make_actions(np.array([token]), velocity, np.array([flip]), count, sim)[0]
         return action
 
 

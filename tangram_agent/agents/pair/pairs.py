@@ -156,7 +156,7 @@ class PairGraph(nn.Module):
             torch.stack([ratio, near, pairs.covered, other_side], dim=-1),
         ]
         everywhere = torch.cat(of_pair, dim=-1)[:, None].expand(-1, self.nodes, -1)
-        target = self.target_flag.expand(len(own), -1, -1)
+        target = self.target_flag.expand(own.shape[0], -1, -1)
         return torch.cat([positions, offsets, target, everywhere], dim=-1)
 
     def _bodies(self, pairs: Pairs, angle: Tensor, other_side: Tensor) -> tuple[Tensor, Tensor]:

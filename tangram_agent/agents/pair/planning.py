@@ -1,63 +1,34 @@
 """Choosing among proposals: a pose for every pair of a token and a piece, and the best one played.
 
 The critic values each proposal for its own piece; the best few are then valued for all pieces of
-the target, as an action is worth the sum of what it covers.
+the target, as an action is worth the sum of what it covers. All of it is one network of fixed
+shapes, so that tangram-export can write it down.
 
-Legend: B environments, K tokens, V corners, M candidates (pairs of all environments, row after
-row).
+Legend: B environments, K tokens, V corners, N candidates of an environment (token, side and piece),
+M = B * N pairs, row after row.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from tangram_agent.agents.pair.coverage import covered_share, covering, worths
+from tangram_agent.agents.pair.covered import Covered
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
-from tangram_agent.base.acting import tensor
-from tangram_agent.base.types import Choice
-from tangram_core.arrays import Bools, Floats
+from tangram_agent.nets.networks import untraced
 from tangram_tasks.place import Place
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
-
-
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """M actions that may be played: each takes a token to a piece of the target.
-
-    Attributes:
-        row: (M,) environment, in order.
-        token: (M,) which token.
-        flip: (M,) 1 where it is turned over.
-        piece: (M,) which piece it is meant for.
-    """
-
-    row: Tensor
-    token: Tensor
-    flip: Tensor
-    piece: Tensor
-
-    def at(self, index: Tensor) -> "Candidates":
-        """The candidates at these indices."""
-        return Candidates(*(part[index] for part in vars(self).values()))
-
-    def best(self, value: Tensor, most: int) -> Tensor:
-        """Indices (M',) of the best of each row by a value (M,), row after row."""
-        # Values row by row, (B, L), filled up with -inf, and where each row begins, (B,).
-        counts = torch.bincount(self.row)
-        first = counts.cumsum(0) - counts
-        table = torch.full((len(counts), int(counts.max())), -torch.inf)
-        table[self.row, torch.arange(len(self.row)) - first[self.row]] = value
-        best = table.topk(min(most, table.shape[1]), dim=1)
-        return (best.indices + first[:, None])[best.values > -torch.inf]
+# Of two that cover as much, the one that fills its own piece: a large triangle on three small
+# pieces is worth as much as one on its own, and leaves what nothing fits.
+_OWN = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """B environments as tensors; sides are 1 where a token lies on its other one.
+    """B environments; sides are 1 where a token lies on its other one.
 
     Attributes:
         pose: (B, K, 3) of the tokens.
@@ -75,79 +46,84 @@ class Scene:
     covered: Tensor
     worth: Tensor
 
-    def pairs(self, c: Candidates) -> Pairs:
-        """The pairs (M,) of candidates; a token that is turned over has changed its side."""
-        return Pairs(
-            pose=self.pose[c.row, c.token],
-            flipped=(self.flipped[c.row, c.token] - c.flip).abs(),
-            token=c.token,
-            goal=self.goal[c.row, c.piece],
-            goal_flipped=self.goal_flipped[c.row, c.piece],
-            piece=c.piece,
-            covered=self.covered[c.row, c.token, c.piece],
-        )
 
-    def leaves_no_choice(self, candidates: Candidates) -> bool:
-        """Whether each environment has one candidate, so that nobody need say which is better."""
-        return len(candidates.row) == len(self.pose)
-
-
-class Planner:
+class Planner(nn.Module):
     """Chooses token, side and pose."""
 
-    def __init__(self, networks: Networks, task: Place, reapply: int) -> None:
-        self._networks, self._layout, self._reapply = networks, task.layout, reapply
-        self._graph = PairGraph(task.layout, task.sim.arena)
-        self._turns_over = task.layout.chiral & task.sim.allow_flip
+    token: Tensor
+    flip: Tensor
+    piece: Tensor
 
-    def choose(self, corners: Floats, placed: Bools, goals: Floats) -> Choice:
+    def __init__(self, networks: Networks, task: Place, reapply: int) -> None:
+        super().__init__()
+        self._networks, self._reapply, self._tokens = networks, reapply, task.layout.tokens
+        self._covered = Covered(task.layout)
+        self._graph = PairGraph(task.layout, task.sim.arena)
+        turns_over = task.layout.chiral & task.sim.allow_flip
+        sides = np.stack([np.ones_like(turns_over), turns_over], axis=-1)
+        every = np.broadcast_to(sides[..., None], (*sides.shape, self._tokens))
+        for name, index in zip(("token", "flip", "piece"), np.nonzero(every), strict=True):
+            self.register_buffer(name, torch.from_numpy(index), persistent=False)
+
+    def forward(self, corners: Tensor, placed: Tensor, goals: Tensor) -> tuple[Tensor, ...]:
         """What to play; where all tokens are placed, some action of the first one.
 
         Args:
-            corners: (B, V, 2) of the tokens.
-            placed: (B, K) which tokens are placed.
+            corners: (B, V, 2) of the tokens, in double precision as goals are.
+            placed: (B, K) 1 where a token is placed.
             goals: (B, V, 2) of the target.
+
+        Returns:
+            (B,) which token, (B,) 1 where it is turned over, and (B, 3) its velocity in [-1, 1].
+
+        Raises:
+            ConfigError: see `untraced`.
         """
-        is_open: Bools = ~np.asarray(placed, np.bool_)
-        is_open[~is_open.any(axis=1), 0] = True
-        with torch.no_grad():
-            scene = self._scene(corners, goals)
-            candidates, pose = self._short_list(scene, is_open)
-            velocity = self._graph.way(scene.pairs(candidates), pose).clamp(-1.0, 1.0)
-            best = self._best(scene, candidates, pose)
-        chosen = candidates.at(best)
-        return Choice(chosen.token.numpy(), chosen.flip.numpy() > 0.5, velocity[best].numpy())
-
-    def _scene(self, corners: Floats, goals: Floats) -> Scene:
-        layout = self._layout
-        covered = covering(corners, goals, layout)
-        return Scene(
-            pose=tensor(layout.poses(corners)),
-            flipped=tensor(layout.flipped(corners)),
-            goal=tensor(layout.poses(goals)),
-            goal_flipped=tensor(layout.flipped(goals)),
-            covered=tensor(covered_share(covered, layout)),
-            worth=tensor(worths(covered, layout)),
-        )
-
-    def _short_list(self, scene: Scene, is_open: Bools) -> tuple[Candidates, Tensor]:
-        """The best few of all pairs that may be played, by their own piece's value, and poses.
-
-        The actor is applied again to its own proposals as often as it is configured.
-        """
-        sides = np.stack([is_open, is_open & self._turns_over], axis=-1)
-        every = np.broadcast_to(sides[..., None], (*sides.shape, self._layout.tokens))
-        row, token, flip, piece = map(torch.from_numpy, np.nonzero(every))
-        candidates = Candidates(row, token, flip.float(), piece)
-        pairs = scene.pairs(candidates)
+        untraced()
+        scene, rows = self._scene(corners, goals), torch.arange(corners.shape[0])[:, None]
+        which = torch.arange(self.token.shape[0]).expand(corners.shape[0], -1)  # (B, N)
+        pairs = self._pairs(scene, rows, which, self.piece[which])
         pose = self._proposed(pairs)
-        if not scene.leaves_no_choice(candidates):
-            best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
-            candidates, pose = candidates.at(best), pose[best]
-            pairs = scene.pairs(candidates)
+        several = self.token.shape[0] > 1
+        if several:
+            value = self._valued(pairs, pose).view(which.shape)
+            value = torch.where(self._allowed(placed), value, -torch.inf)
+            own, which = value.topk(min(_SHORT_LIST, value.shape[1]))
+            pose = pose.view(*value.shape, 3)[rows, which].flatten(0, 1)
+            pairs = self._pairs(scene, rows, which, self.piece[which])
         for _ in range(self._reapply):
             pose = self._proposed(pairs.at(pose))
-        return candidates, pose
+        velocity = self._graph.way(pairs, pose).clamp(-1.0, 1.0).view(*which.shape, 3)
+        if several:
+            at = (self._gained(scene, rows, which, pose) + _OWN * own).argmax(1, keepdim=True)
+            which, velocity = which.gather(1, at), velocity[rows, at]
+        return self.token[which[:, 0]], self.flip[which[:, 0]], velocity[:, 0]
+
+    def _scene(self, corners: Tensor, goals: Tensor) -> Scene:
+        """Poses and what is covered; geometry is in double precision, what networks see is not."""
+        lying, wanted = self._covered(corners), self._covered(goals)
+        shares = self._covered.shares(lying, wanted)
+        return Scene(*_pose(*lying), *_pose(*wanted), *(one.float() for one in shares))
+
+    def _allowed(self, placed: Tensor) -> Tensor:
+        """(B, N) candidates whose token is open; of the first one, where none is."""
+        is_open = placed == 0
+        first = torch.arange(self._tokens) == 0
+        return (is_open | (first & ~is_open.any(1, keepdim=True)))[:, self.token]
+
+    def _pairs(self, scene: Scene, rows: Tensor, which: Tensor, piece: Tensor) -> Pairs:
+        """The pairs of candidates (B, N'), with pieces (B, N'), in a row."""
+        token, flip = self.token[which], self.flip[which]
+        parts = {
+            "pose": scene.pose[rows, token],
+            "flipped": (scene.flipped[rows, token] - flip).abs(),
+            "token": token,
+            "goal": scene.goal[rows, piece],
+            "goal_flipped": scene.goal_flipped[rows, piece],
+            "piece": piece,
+            "covered": scene.covered[rows, token, piece],
+        }
+        return Pairs(**{name: part.flatten(0, 1) for name, part in parts.items()})
 
     def _proposed(self, pairs: Pairs) -> Tensor:
         """Poses (M, 3) that the actor gives to the tokens of pairs."""
@@ -159,14 +135,17 @@ class Planner:
         values: Tensor = self._networks.critic(pairs, self._graph.way(pairs, pose), pairs.at(pose))
         return values
 
-    def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
-        """Index (B,) of the best candidate of each row, valued for all pieces of the target."""
-        if scene.leaves_no_choice(candidates):
-            return torch.arange(len(pose))
-        count = self._layout.tokens
-        every = candidates.at(torch.arange(len(pose)).repeat_interleave(count))
-        pairs = scene.pairs(replace(every, piece=torch.arange(count).repeat(len(pose))))
+    def _gained(self, scene: Scene, rows: Tensor, which: Tensor, pose: Tensor) -> Tensor:
+        """(B, N') what candidates in poses are worth for all pieces, less what they give up."""
+        count = self._tokens
+        every = which.repeat_interleave(count, dim=1)
+        piece = torch.arange(count).repeat(which.shape[1]).expand(every.shape)
+        pairs = self._pairs(scene, rows, every, piece)
         values = self._valued(pairs, pose.repeat_interleave(count, dim=0))
-        # What a token covers already it gives up.
-        given_up = scene.worth[candidates.row, candidates.token]
-        return candidates.best(values.view(-1, count).sum(dim=1) - given_up, 1)
+        return values.view(*which.shape, count).sum(2) - scene.worth[rows, self.token[which]]
+
+
+def _pose(centres: Tensor, turns: Tensor, flipped: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses (B, K, 3) and sides (B, K) of what `Covered` says, in single precision."""
+    angles = torch.atan2(turns[..., 1].float(), turns[..., 0].float())
+    return torch.cat([centres.float(), angles[..., None]], dim=-1), flipped.float()

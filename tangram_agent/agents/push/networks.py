@@ -11,7 +11,7 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from tangram_agent.agents.push.scenes import PUSHES, Tokens
 from tangram_agent.agents.push.seen import PUSH, Seen, other_numbers, token_numbers
-from tangram_agent.nets.networks import perceptron
+from tangram_agent.nets.networks import perceptron, untraced
 
 _FAR = 0.2  # of a token that is pushed
 
@@ -32,6 +32,7 @@ class Critic(nn.Module):
 
     def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
         """(n, N) of pushes (n, N, 22)."""
+        untraced()
         other = self.others(self.other(seen.other) * seen.there)
         scene = self.scene(self.mixed(self.token(seen.token) + other))
         value: Tensor = self.value(scene[:, None] + self.push(pushes))

@@ -3,19 +3,34 @@
 Legend: B environments.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from tangram_agent.agents.scene.agent import SceneConfig
 from tangram_agent.agents.scene.networks import ActorNet
-from tangram_agent.agents.scene.scenes import Scenes, next_token
-from tangram_agent.base.acting import NetworkActor, tensor
+from tangram_agent.agents.scene.scenes import whole
+from tangram_agent.base.acting import NetworkActor, as_actions, tensor
 from tangram_core.arrays import Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Generators, History
-from tangram_sim.motion.actions import make_actions
 from tangram_tasks.place import Place
 from tangram_tasks.played import closed
+
+
+class Decision(nn.Module):
+    """Actions (B, A) of the task's fields, by name, exploration off."""
+
+    def __init__(self, task: Place, network: nn.Module) -> None:
+        super().__init__()
+        self._task, self.network = task, network
+
+    def forward(self, seen: Mapping[str, Tensor]) -> Tensor:
+        """Of fields (B, ...), as `Place.spec` names them."""
+        scenes = whole(seen)
+        return as_actions(scenes.token, None, self.network(scenes)[0], self._task)
 
 
 class SceneActor(NetworkActor):
@@ -27,15 +42,17 @@ class SceneActor(NetworkActor):
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
         """Actions (B, A), with Gaussian noise and a share of them uniform where it explores."""
-        flags = tensor(closed(seen))
-        token = next_token(flags)
+        shown = {"placed": closed(seen), "corners": seen["corners"], "goals": seen["goals"]}
         with torch.inference_mode():
-            scenes = Scenes(tensor(seen["corners"]), flags, tensor(seen["goals"]), token)
-            velocity, raw = (one.numpy() for one in self.network(scenes))
-        if explore is not None:
-            velocity = self._explored(velocity, raw, explore)
-        stay, count = np.zeros(len(token), np.bool_), self._task.layout.tokens
-        return make_actions(token.numpy(), velocity, stay, count, self._task.sim)
+            scenes = whole({name: tensor(array) for name, array in shown.items()})
+            velocity, raw = self.network(scenes)
+            if explore is not None:
+                velocity = torch.from_numpy(self._explored(velocity.numpy(), raw.numpy(), explore))
+            return np.asarray(as_actions(scenes.token, None, velocity, self._task).numpy())
+
+    def graph(self) -> "Decision":
+        """The actor itself."""
+        return Decision(self._task, self.network)
 
     def _explored(self, velocity: Singles, raw: Singles, explore: Generators) -> Singles:
         """Velocities (B, 3) with noise, before the last tanh or after it; some are uniform."""

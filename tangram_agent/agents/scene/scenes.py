@@ -1,11 +1,13 @@
 """Whole scenes: all tokens and the whole target in one graph, as the paper has it (Sec. IV-A)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from tangram_sim.geometry.layout import Layout
+from tangram_tasks.played import closed
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,12 @@ class Scenes:
 def next_token(placed: Tensor) -> Tensor:
     """Which token moves, (B,): the first that is not placed (B, K); 0 where all are."""
     return (placed == 0).int().argmax(dim=-1)
+
+
+def whole(seen: Mapping[str, Tensor]) -> Scenes:
+    """The scenes of a task's fields (B, ...), by name; the next token is to move."""
+    placed = closed(seen)
+    return Scenes(seen["corners"], placed, seen["goals"], next_token(placed))
 
 
 class SceneGraph(nn.Module):

@@ -9,11 +9,14 @@ import pytest
 import torch
 
 from tangram_agent.agents.pair import planning
+from tangram_agent.agents.pair.actor import Decision
 from tangram_agent.agents.pair.coverage import covered_share, covering, worths
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.agents.pair.planning import Planner
+from tangram_agent.base.types import Choice
 from tangram_agent.nets.networks import initialise
+from tangram_core.arrays import Bools, Floats
 from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.actions import velocities_of
@@ -57,6 +60,13 @@ def perfect(made: Setup) -> Planner:
 
 def planner(networks: Networks, made: Setup) -> Planner:
     return Planner(networks, made.task, made.agent.config.reapply)
+
+
+def chosen(chooser: Planner, corners: Floats, placed: Bools, goals: Floats) -> Choice:
+    with torch.no_grad():
+        every = chooser(*(torch.from_numpy(one) for one in (corners, placed, goals)))
+    token, flip, velocity = (one.numpy() for one in every)
+    return Choice(token, flip > 0, velocity)
 
 
 # Against brute force
@@ -110,7 +120,7 @@ def test_the_best_of_all_is_played(
     made = setup(TWO, {"reapply": options.get("reapply", 0)}, net, allow_flip=flip)
     networks = random_networks(made)
     corners, placed, goals = scenes(made)
-    choice = planner(networks, made).choose(corners, placed, goals)
+    choice = chosen(planner(networks, made), corners, placed, goals)
     for row in range(COUNT):
         scene = corners[row], placed[row], goals[row]
         every = [
@@ -132,10 +142,10 @@ def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]
     chooser = planner(random_networks(made), made)
     corners, placed, goals = scenes(made, COUNT)
     placed[3] = True
-    together = chooser.choose(corners, placed, goals)
+    together = chosen(chooser, corners, placed, goals)
     for row in range(COUNT):
         one = slice(row, row + 1)
-        alone = chooser.choose(corners[one], placed[one], goals[one])
+        alone = chosen(chooser, corners[one], placed[one], goals[one])
         for name, column in vars(alone).items():
             np.testing.assert_allclose(column[0], vars(together)[name][row], atol=1e-5)
 
@@ -143,10 +153,10 @@ def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]
 def test_no_placed_token_is_named_while_others_are_left() -> None:
     made = seven()
     corners, placed, goals = scenes(made, 40)
-    token = planner(random_networks(made), made).choose(corners, placed, goals).token
+    token = chosen(planner(random_networks(made), made), corners, placed, goals).token
     assert not placed[np.arange(40), token].any()
     assert len(set(token)) > 1
-    nothing = planner(random_networks(made), made).choose(corners, placed | True, goals)
+    nothing = chosen(planner(random_networks(made), made), corners, placed | True, goals)
     assert not nothing.token.any()
 
 
@@ -156,7 +166,7 @@ def test_no_placed_token_is_named_while_others_are_left() -> None:
 def assembled(made: Setup, chooser: Planner, episodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Overlap at the end (B,), and flips (B, T) of whole episodes."""
     policy = Policy(made)
-    policy.actor._planner = chooser  # perfect networks have no weights to load
+    policy.actor._decides = Decision(made.task, chooser)  # perfect networks have no weights to load
     flips = []
     with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, episodes)) as env:
         env.reset([np.random.default_rng([7, i]) for i in range(episodes)])
@@ -183,6 +193,6 @@ def test_a_token_is_turned_over_just_where_its_piece_lies_on_the_other_side() ->
     rng = np.random.default_rng(0)
     own, wanted = (random_scene(made.task.layout, rng, 40) for _ in range(2))
     corners, goals = made.task.layout.corners(*own), made.task.layout.corners(*wanted)
-    choice = perfect(made).choose(corners, np.zeros((40, 1), np.bool_), goals)
+    choice = chosen(perfect(made), corners, np.zeros((40, 1), np.bool_), goals)
     np.testing.assert_array_equal(choice.flip, (own[1] ^ wanted[1])[:, 0])
     assert 5 < choice.flip.sum() < 35

@@ -1,0 +1,162 @@
+"""tangram-export: an agent as an ONNX file, which onnxruntime plays without torch.
+
+Legend: B observations, A entries of an action.
+"""
+
+import json
+import logging
+import tempfile
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from torch import nn
+
+from tangram_agent.runs import Run, beginning, load_changed
+from tangram_core.agent import AT_ONCE
+from tangram_core.arrays import Singles
+from tangram_core.errors import RunError
+from tangram_core.spec import Arrays
+from tangram_core.store.files import write_whole
+from tangram_core.task import Generators, History
+from tangram_game.config import ExportConfig
+from worker.score.test_set import FixedTests
+
+OPSET = 20  # of ONNX 1.15, 2023
+OBSERVATIONS, CLOSE = 1000, 1e-5  # that must agree so well with torch
+OUTPUT = "action"
+_NEAR, _ROUNDING = 64, 1e-5  # neighbours of an observation that are asked, and how near they are
+
+
+def export_run(config: ExportConfig, tell: Callable[[str], None] = print) -> int:
+    """Write an agent as ONNX once it plays as in torch; returns exit status 0.
+
+    Raises:
+        RunError: the run is missing or corrupt, the file is not writable, or it plays otherwise.
+        ConfigError: the agent is more than a network.
+    """
+    torch.set_num_threads(1)
+    run = load_changed(config.run_dir, config.changes)
+    content = exported(run)
+    found = compared(run, content)
+    if not found.apart <= CLOSE:
+        raise RunError(
+            f"{config.out} is not written: an action in {found.count} observations is "
+            f"{found.apart:.1e} off torch's, and {CLOSE:g} is the most: try the versions of onnx "
+            "and onnxruntime that constraints.txt names, or play it by load_run"
+        )
+    write_whole(Path(config.out), content)
+    spec = run.setup.spec
+    sides = {name: ", ".join(map(str, spec.field(name).shape)) for name in inputs(run)}
+    seen = ", ".join(f"{name} (B, {own})" for name, own in sides.items())
+    tell(f"{config.out}: {OUTPUT} (B, {spec.action_size}) of {seen}, all float32")
+    ties = f"; {found.ties} ties, of equal worth, go another way" if found.ties else ""
+    tell(f"in {found.count} observations at most {found.apart:.1e} off what torch plays{ties}")
+    return 0
+
+
+def inputs(run: Run) -> tuple[str, ...]:
+    """The names of what it sees: the fields that the task's environments show."""
+    return tuple(field.name for field in run.setup.spec.fields if field.per != "step")
+
+
+def exported(run: Run) -> bytes:
+    """The file: inputs by the names of the task's fields, any number of rows at a time.
+
+    Raises:
+        ConfigError: the agent is more than a network.
+    """
+    network: nn.Module = run.actor.graph().eval()
+    spec, rows = run.setup.spec, {0: torch.export.Dim.DYNAMIC}
+    names = inputs(run)
+    seen = {name: torch.zeros(2, *spec.field(name).shape) for name in names}
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        warnings.simplefilter("ignore")  # of torch, at its own code
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        made = torch.onnx.export(
+            network,
+            (),
+            kwargs={"seen": seen},
+            input_names=names,
+            output_names=(OUTPUT,),
+            dynamic_shapes={"seen": dict.fromkeys(names, rows)},
+            opset_version=OPSET,
+            dynamo=True,
+            optimize=False,  # onnxruntime does, when it loads it; here it takes half the time
+            verbose=False,
+        )
+        path = Path(folder) / "agent.onnx"
+        made.save(path)
+        model = onnx.load(path)
+    return _clean(model, run)
+
+
+def _clean(model: onnx.ModelProto, run: Run) -> bytes:
+    """Without the lines of code that torch notes at each node, with what it is of."""
+    for graph in (model.graph, *model.functions):
+        for node in graph.node:
+            del node.metadata_props[:]
+            node.doc_string = ""
+        del graph.metadata_props[:]
+    for value in (*model.graph.input, *model.graph.output):
+        value.type.tensor_type.shape.dim[0].dim_param = "rows"
+    del model.metadata_props[:]
+    told = {"task": run.setup.task_kind, "updates": str(run.updates)}
+    onnx.helper.set_model_props(model, told | {"setup": json.dumps(run.setup.contents())})
+    content: bytes = model.SerializeToString()
+    return content
+
+
+@dataclass
+class Compared:
+    """How observations of real play are answered, beside torch.
+
+    Attributes:
+        count: of them.
+        apart: how far an action is off, at most, ties left out.
+        ties: of two choices of equal worth another one.
+    """
+
+    count: int = 0
+    apart: float = 0.0
+    ties: int = 0
+
+
+def compared(run: Run, content: bytes) -> Compared:
+    """Play so many observations in both ways, on one thread each."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = 1, 3  # errors alone
+    session, found = onnxruntime.InferenceSession(content, options), Compared()
+
+    def choose(seen: Arrays, past: History, _: Generators) -> Singles:
+        shown = {name: np.asarray(seen[name], np.float32) for name in inputs(run)}
+        own = run.actor.act(shown, past)
+        (other,) = session.run(None, shown)
+        apart = np.abs(own - other).max(axis=1)
+        for row in np.flatnonzero(apart > CLOSE):
+            if _is_tie(run, {name: one[row] for name, one in shown.items()}, other[row]):
+                found.ties, apart[row] = found.ties + 1, 0.0
+        found.count, found.apart = found.count + len(own), max(found.apart, float(apart.max()))
+        return own
+
+    horizon = run.setup.spec.horizon
+    with closing(FixedTests(run.setup.task, -(-OBSERVATIONS // horizon), AT_ONCE)) as tests:
+        tests.play(choose)
+    return found
+
+
+def _is_tie(run: Run, shown: Arrays, other: Singles) -> bool:
+    """Whether torch itself plays (A,) so where what it sees is off by rounding."""
+    rng, near = np.random.default_rng(0), dict[str, Singles]()
+    for name, one in shown.items():
+        near[name] = np.repeat(one[None], _NEAR, axis=0)
+        if run.setup.spec.field(name).dtype == "f4":
+            near[name] += np.float32(_ROUNDING) * rng.standard_normal(near[name].shape, np.float32)
+    actions = run.actor.act(near, beginning(run.setup.spec, near))
+    return bool((np.abs(actions - other).max(axis=1) < 10 * _ROUNDING).any())

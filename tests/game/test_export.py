@@ -1,0 +1,99 @@
+"""Agents as ONNX files: onnxruntime plays them as torch does."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+import tests.core.toy  # noqa: F401 - registers environments
+from tangram_agent.runs import Run
+from tangram_core.agent import Weights
+from tangram_core.errors import ConfigError, RunError
+from tangram_core.setup import Setup, make_setup
+from tangram_game import export
+from tangram_game.config import ExportConfig
+from tests.agent.builders import PAIR, SCENE, SMALL, setup
+
+pytestmark = pytest.mark.slow
+
+TOY = {"kind": "gym", "id": "Toy-v0", "imports": ["tests.core.toy"]}
+TURNED = {"shapes": ["parallelogram", "large_triangle"], "scale": 0.8}
+PERCEPTRON = {"kind": "mlp", "hidden": [16]}
+
+
+def toy(algorithm: str) -> Setup:
+    agent = {"kind": "goal", "algorithm": algorithm, "hidden": [16]}
+    return make_setup({"task": TOY, "agent": agent})
+
+
+def run(made: Setup, seed: int = 0) -> Run:
+    weights = made.agent.learner(made.task, seed, "cpu").broadcast()
+    return Run(Path("runs/one"), {}, made, Weights(seed, weights))
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        toy("td3"),
+        toy("sac"),
+        setup(PAIR, SCENE, SMALL),
+        pytest.param(
+            setup(TURNED, {"reapply": 1}, PERCEPTRON, allow_flip=True, mirrored=0.5),
+            marks=pytest.mark.check,
+        ),
+    ],
+    ids=["td3", "sac", "scene", "pair"],
+)
+def test_an_agent_plays_alike(
+    made: Setup, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, out = run(made), tmp_path / "agent.onnx"
+    monkeypatch.setattr(export, "load_changed", lambda *_: own)
+    export.export_run(ExportConfig("runs/one", str(out)))
+    told = capsys.readouterr().out
+    assert "at most 0" not in told  # two ways of computing differ somewhere
+    assert [line.split()[0] for line in told.splitlines()] == [f"{out}:", "in"]
+    model = onnx.load(out)
+    assert next((one.domain, one.version) for one in model.opset_import) == ("", export.OPSET)
+    assert str(Path.cwd()).encode() not in out.read_bytes()  # no path of this machine
+    session = onnxruntime.InferenceSession(out)
+    spec = made.spec
+    wanted = {f.name: ["rows", *f.shape] for f in spec.fields if f.per != "step"}
+    assert {one.name: one.shape for one in session.get_inputs()} == wanted
+    alone = session.run(["action"], {n: np.zeros((1, *s[1:]), "f4") for n, s in wanted.items()})
+    assert alone[0].shape == (1, spec.action_size)
+
+    # What plays otherwise is not written.
+    content = out.read_bytes()
+    out.unlink()
+    own = run(made, seed=1)
+    monkeypatch.setattr(export, "exported", lambda _: content)
+    with pytest.raises(RunError, match="off torch's, and 1e-05 is the most"):
+        export.export_run(ExportConfig("runs/one", str(out)))
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["hand", "tangram7_silhouette"])
+def test_who_searches_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="Actor decides by a search, .* play it by"):
+        export.export_run(ExportConfig(f"pretrained/{name}", str(tmp_path / "agent.onnx")))
+
+
+def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tangram_game.config.find_spec", lambda name: name == "onnx" or None)
+    with pytest.raises(ConfigError, match="pip install onnxscript onnxruntime$"):
+        ExportConfig("pretrained/square")
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")
+@pytest.mark.parametrize("made", [toy("td3"), toy("sac"), setup(PAIR, SCENE), setup(PAIR)])
+def test_a_trace_is_refused(made: Setup) -> None:
+    own = run(made)
+    shapes: dict[str, Any] = {name: made.spec.field(name).shape for name in export.inputs(own)}
+    seen = {name: torch.zeros(2, *shape) for name, shape in shapes.items()}
+    with pytest.raises(ConfigError, match="tangram-export writes an agent down"):
+        torch.jit.trace(own.actor.graph(), (seen,))
