@@ -13,7 +13,7 @@ from tangram_sim.geometry.layout import Layout
 BACKGROUND = 255
 TOKEN_GRAY = 80
 _MIDDLE = (BACKGROUND + TOKEN_GRAY) // 2
-_FINER = 4  # a grey picture is averaged from one with so many times the pixels along a side
+_FINER = 4  # what agents see is averaged from so many times the pixels along a side
 
 
 def token_pixels(picture: Pixels) -> Bools:
@@ -24,7 +24,7 @@ def token_pixels(picture: Pixels) -> Bools:
 
 def taken_pixels(sim: SimConfig) -> int:
     """The side of the picture that is taken before it is averaged."""
-    return sim.pixels * (_FINER if sim.picture == "grey" else 1)
+    return sim.pixels * (_FINER if sim.looks else 1)
 
 
 def averaged(picture: Pixels, pixels: int) -> Pixels:
@@ -37,6 +37,12 @@ def averaged(picture: Pixels, pixels: int) -> Pixels:
     whole = sum(rows[:, column::times] for column in range(times))
     mean: Pixels = np.round(whole / times**2).astype(np.uint8)
     return mean
+
+
+def photograph(corners: Floats, layout: Layout, sim: SimConfig) -> Pixels:
+    """What the camera shows, (P, P), of tokens with corners (V, 2), without an engine."""
+    taken = rasterise(corners, layout, sim.arena * sim.view, taken_pixels(sim))
+    return averaged(taken, sim.pixels)
 
 
 def rasterise(corners: Floats, layout: Layout, arena: float, pixels: int) -> Pixels:

@@ -25,7 +25,6 @@ from tangram_vision.pictures.levels import coverage
 from tangram_vision.pictures.piles import Laid, arrangements, reaching_out
 from tangram_vision.pictures.ramps import fitted, ramps
 from tangram_vision.pictures.recalling import recalled
-from tangram_vision.pictures.samples import binary, settled
 
 _SMALLEST = 0.4  # of the smallest token: less is dirt
 _CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
@@ -81,7 +80,7 @@ def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = Non
 def _puzzle(cover: Singles, kinds: Sequence[Kind], left: Counter[int]) -> "_Puzzle":
     """What coverage (P, P) by so many tokens of each shape shows."""
     blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
-    return _Puzzle(blobs, kinds, left, binary(cover))
+    return _Puzzle(blobs, kinds, left)
 
 
 def _stayed(
@@ -128,7 +127,6 @@ class _Puzzle:
     blobs: Blobs
     kinds: Sequence[Kind]
     left: Counter[int]
-    sharp: bool
     _known: dict[tuple[int, tuple[int, ...]], list[_Explained]] = field(default_factory=dict)
     _tries: int = 0
 
@@ -261,9 +259,6 @@ class _Puzzle:
         poses, spread = refined(shapes, rough, blobs.cover, blobs.base[blob])
         best = _least(blob, spread)
         best = best[spread[best] < _ROUGH]
-        if self.sharp and len(best):
-            own = [shapes[row] for row in best.tolist()]
-            poses[best] = settled(own, poses[best], blobs.cover, blobs.base[blob[best]])
         return {
             int(blob[row]): _Explained(Laid((int(kind[row]),), poses[row : row + 1], 0.0))
             for row in best.tolist()
