@@ -6,7 +6,7 @@ arena / 2, y = arena / 2 - (row + 1/2) * arena / P: rows run down, as in every i
 
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_core.arrays import Bools, Floats, Pixels, Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 
@@ -20,6 +20,12 @@ def token_pixels(picture: Pixels) -> Bools:
     """(P, P), where a picture shows a token, by more than half: px = 1 of Eq. 14."""
     mask: Bools = np.less(picture, _MIDDLE)
     return mask
+
+
+def coverage(picture: Pixels) -> Singles:
+    """(P, P), the share of each pixel that a picture shows covered by tokens."""
+    covered: Singles = (np.float32(BACKGROUND) - picture) / np.float32(BACKGROUND - TOKEN_GRAY)
+    return covered
 
 
 def taken_pixels(sim: SimConfig) -> int:

@@ -9,7 +9,7 @@ from tangram_core.arrays import Bools, Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.sight.perception import Look, Sight
-from tangram_sim.sight.pictures import photograph
+from tangram_sim.sight.pictures import coverage, photograph
 from tangram_tasks.push.places import ARENA, part
 from tangram_vision.pictures.seeing import see
 
@@ -28,7 +28,7 @@ class Camera:
         self._part = own = part(self._layout, tuple(self._tokens.tolist()))
 
         def look(picture: Pixels, _before: Look | None = None) -> Look:
-            return see(picture, own, ARENA)
+            return see(coverage(picture), own, ARENA)
 
         self._sight = Sight(own, look, 1, ARENA)
         picture, own_corners = self._picture(corners), corners[None, self._rows]

@@ -14,11 +14,11 @@ from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area, overlap
 from tangram_sim.geometry.dissections import Dissection, Laid
 from tangram_sim.puzzles.figures import load_puzzle
+from tangram_sim.sight.pictures import coverage
 from tangram_sim.targets.connected import sample_connected
 from tangram_sim.targets.targets import placement, turned_figure
 from tangram_sim.world.world import make_world
 from tangram_vision.pictures.kinds import kinds_of
-from tangram_vision.pictures.levels import coverage
 from tangram_vision.silhouettes.outlines import WAYS, Way, outline
 from tangram_vision.silhouettes.silhouette_pictures import _cropped, _Explainer, fill_picture
 from tangram_vision.silhouettes.silhouettes import Filled, Method, covered
@@ -42,9 +42,7 @@ def shown(lies: Dissection, pixels: int) -> Singles:
     sim = SimConfig(backend="kinematic", arena=ARENA, pixels=pixels, observe="pictures")
     with closing(make_world(LAYOUT, sim)) as world:
         world.place(lies.poses, lies.flipped)
-        cover = coverage(world.picture())
-    assert cover is not None
-    return cover
+        return coverage(world.picture())
 
 
 @pytest.mark.parametrize(("pixels", "least"), [(128, 0.99), (64, 0.97)])
