@@ -181,7 +181,7 @@ def _told(task: Place) -> str:
 def _observed(sim: SimConfig) -> str:
     """What agents see, in words."""
     if sim.looks:
-        return f"{sim.picture} pictures of {sim.pixels} px"
+        return f"pictures of {sim.pixels} px"
     if sim.observe == "silhouette":
         return "exact outlines, pieces hidden"
     return "exact corners"

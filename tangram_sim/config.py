@@ -13,11 +13,8 @@ BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense")
 SOURCES = ("polygon", "camera")
 MIN_PIXELS = 16
-PICTURES = ("binary", "grey")
 SILHOUETTE = "silhouette"  # what the target looks like without its pieces
 OBSERVED = ("corners", "pictures", SILHOUETTE)
-# The settings of the camera.
-CAMERA = ("pixels", "view", "picture")
 MOTIONS = ("lift", "slide")
 # Share of a token that may come to lie on others where it is set down: the engine pushes such
 # tokens apart by a little, and with more it would move what is placed.
@@ -88,13 +85,6 @@ class SimConfig(Settings, section="sim"):
         high=100,
         unless={"pixels": 0},
     )
-    picture: str = setting(
-        "binary",
-        "what the camera takes: binary shows at each pixel what is at its centre; grey is averaged "
-        "from a larger picture, as a real camera does",
-        choices=PICTURES,
-        unless={"pixels": 0},
-    )
 
     @property
     def looks(self) -> bool:
@@ -104,8 +94,7 @@ class SimConfig(Settings, section="sim"):
     @property
     def blind(self) -> "SimConfig":
         """The same world without a camera."""
-        usual = {name: getattr(SimConfig, name) for name in (*CAMERA, "observe")}
-        return replace(self, **usual)
+        return replace(self, pixels=0, view=1.0, observe="corners")
 
     def __post_init__(self) -> None:
         if self.looks:

@@ -13,6 +13,7 @@ from tangram_core.task import Env, Generators, Json, Purpose, Step
 from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import MAX_OVERLAP
 from tangram_sim.sight.perception import Eye, Look
+from tangram_sim.sight.pictures import coverage
 from tangram_sim.targets.targets import Sides
 from tangram_sim.world.world import no_opencv
 
@@ -131,6 +132,6 @@ def make_eye(task: "Place") -> Eye | None:
     layout, arena = task.layout, task.sim.arena
 
     def look(picture: Pixels, before: Look | None = None) -> Look:
-        return see(picture, layout, arena, before)
+        return see(coverage(picture), layout, arena, before)
 
     return look

@@ -124,7 +124,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.pixels": (CAMERA, 32),
     "sim.view": (over(CAMERA, sim={"pixels": 32}), 2.0),
     "sim.overhang": (ONE, True),
-    "sim.picture": (CAMERA, "grey"),
     "sim.observe": (SEEN, "pictures"),
     "reward.name": (ONE, "dense"),
     "reward.source": (SEEN, "camera"),
@@ -327,7 +326,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
-        (ONE, "sim.picture", "grey", "sim.pixels=0"),
         (over(ONE, sim={"observe": "silhouette"}), "sim.pixels", 64, "sim.observe=silhouette"),
     ],
 )

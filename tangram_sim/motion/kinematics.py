@@ -5,7 +5,7 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.sight.pictures import averaged, rasterise, taken_pixels
+from tangram_sim.sight.pictures import photograph
 
 
 class KinematicWorld:
@@ -40,9 +40,7 @@ class KinematicWorld:
     def picture(self) -> Pixels:
         """See `World.picture`."""
         corners = self._layout.corners(self._poses, self._flipped)
-        shown = self._sim.arena * self._sim.view
-        taken = rasterise(corners, self._layout, shown, taken_pixels(self._sim))
-        return averaged(taken, self._sim.pixels)
+        return photograph(corners, self._layout, self._sim)
 
     def close(self) -> None:
         """See `World.close`."""

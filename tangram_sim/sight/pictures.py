@@ -6,14 +6,14 @@ arena / 2, y = arena / 2 - (row + 1/2) * arena / P: rows run down, as in every i
 
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_core.arrays import Bools, Floats, Pixels, Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 
 BACKGROUND = 255
 TOKEN_GRAY = 80
 _MIDDLE = (BACKGROUND + TOKEN_GRAY) // 2
-_FINER = 4  # a grey picture is averaged from one with so many times the pixels along a side
+_FINER = 4  # what agents see is averaged from so many times the pixels along a side
 
 
 def token_pixels(picture: Pixels) -> Bools:
@@ -22,9 +22,15 @@ def token_pixels(picture: Pixels) -> Bools:
     return mask
 
 
+def coverage(picture: Pixels) -> Singles:
+    """(P, P), the share of each pixel that a picture shows covered by tokens."""
+    covered: Singles = (np.float32(BACKGROUND) - picture) / np.float32(BACKGROUND - TOKEN_GRAY)
+    return covered
+
+
 def taken_pixels(sim: SimConfig) -> int:
     """The side of the picture that is taken before it is averaged."""
-    return sim.pixels * (_FINER if sim.picture == "grey" else 1)
+    return sim.pixels * (_FINER if sim.looks else 1)
 
 
 def averaged(picture: Pixels, pixels: int) -> Pixels:
@@ -37,6 +43,12 @@ def averaged(picture: Pixels, pixels: int) -> Pixels:
     whole = sum(rows[:, column::times] for column in range(times))
     mean: Pixels = np.round(whole / times**2).astype(np.uint8)
     return mean
+
+
+def photograph(corners: Floats, layout: Layout, sim: SimConfig) -> Pixels:
+    """What the camera shows, (P, P), of tokens with corners (V, 2), without an engine."""
+    taken = rasterise(corners, layout, sim.arena * sim.view, taken_pixels(sim))
+    return averaged(taken, sim.pixels)
 
 
 def rasterise(corners: Floats, layout: Layout, arena: float, pixels: int) -> Pixels:

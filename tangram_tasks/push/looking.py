@@ -9,17 +9,17 @@ from tangram_core.arrays import Bools, Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.sight.perception import Look, Sight
-from tangram_sim.sight.pictures import averaged, rasterise, taken_pixels
+from tangram_sim.sight.pictures import coverage, photograph
 from tangram_tasks.push.places import ARENA, part
 from tangram_vision.pictures.seeing import see
 
 
 class Camera:
-    """Finds the tokens of one table in grey pictures from above."""
+    """Finds the tokens of one table in pictures from above."""
 
     def __init__(self, layout: Layout, pixels: int) -> None:
         self._layout = layout
-        self._sim = SimConfig(arena=ARENA, pixels=pixels, picture="grey")
+        self._sim = SimConfig(arena=ARENA, pixels=pixels, observe="pictures")
 
     def begin(self, corners: Floats, present: Bools) -> Floats:
         """(V, 2) corners as they are seen of tokens (K,) that are on the table."""
@@ -28,7 +28,7 @@ class Camera:
         self._part = own = part(self._layout, tuple(self._tokens.tolist()))
 
         def look(picture: Pixels, _before: Look | None = None) -> Look:
-            return see(picture, own, ARENA)
+            return see(coverage(picture), own, ARENA)
 
         self._sight = Sight(own, look, 1, ARENA)
         picture, own_corners = self._picture(corners), corners[None, self._rows]
@@ -43,8 +43,7 @@ class Camera:
 
     def _picture(self, corners: Floats) -> Pixels:
         """(1, P, P)."""
-        taken = rasterise(corners[self._rows], self._part, ARENA, taken_pixels(self._sim))
-        return averaged(taken, self._sim.pixels)[None]
+        return photograph(corners[self._rows], self._part, self._sim)[None]
 
     def _as_seen(self, corners: Floats) -> Floats:
         seen = corners.copy()

@@ -63,7 +63,7 @@ class PushConfig(Settings, section="task"):
     longest: float = setting(0.5, "way of the longest push", low=0.05, high=2)
     pixels: int = setting(
         0,
-        "side of a grey picture in which tokens are found, from 16; 0: their corners are known",
+        "side of a picture in which tokens are found, from 16; 0: their corners are known",
         low=0,
         high=1024,
     )

@@ -21,7 +21,6 @@ from tangram_sim.sight.perception import Look
 from tangram_sim.targets.connected import MAX_PILE
 from tangram_vision.pictures.blobs import find_blobs, likeness
 from tangram_vision.pictures.kinds import kinds_of
-from tangram_vision.pictures.levels import MIN_CONTRAST
 from tangram_vision.pictures.seeing import see
 from tangram_vision.silhouettes.tilts import from_above, shift
 
@@ -35,13 +34,13 @@ _AROUND = 3  # pixels around one area
 _MANY = 40  # areas whose shapes are told
 _SIZE = 1.6  # times that an area may be larger or smaller than the token that it looks like
 _LIKE = 0.25  # moments nearer than this make an area look like a token
-_CLEAN = 12  # levels between ground and tokens that are enough where the ground has no noise
+_CONTRAST = 40  # levels between ground and tokens; less is taken for noise, and
+_CLEAN = 12  # is enough where the ground has none
 _POINTS = 100  # of the light along a side
 _BORDER = 5  # points of the light from each side that show the ground
 _ROUNDS = 24
 _STEEP = 3.0  # how much steeper edges are made: less than a third is a shadow
 _NOTHING = "no token alone"
-_GROUND, _TOKEN = 230, 60  # levels of the picture that is looked at
 
 
 class LackingError(ConfigError):
@@ -146,7 +145,7 @@ def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":
         at_edge = f" but what reaches its edge ({spots.cut})" if spots.cut else ""
         raise ConfigError(
             f"{source} shows nothing{at_edge} that is darker or lighter than its ground by "
-            f"{_CLEAN} of 255 levels, {MIN_CONTRAST} where that is uneven: take it with dark "
+            f"{_CLEAN} of 255 levels, {_CONTRAST} where that is uneven: take it with dark "
             "tokens on light ground, or light ones on dark"
         )
     return spots
@@ -155,9 +154,7 @@ def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":
 def _seen(cover: Singles, layout: Layout, view: float) -> Look | None:
     """All tokens of a layout in a square of coverage that is so wide; None if some are missing."""
     for pixels in _PIXELS:
-        small = _smaller(cover, pixels)
-        levels = np.round(_GROUND + (_TOKEN - _GROUND) * small).astype(np.uint8)
-        seen = see(levels, layout, view)
+        seen = see(_smaller(cover, pixels), layout, view)
         if seen.known.all():
             return seen
     return None
@@ -210,7 +207,7 @@ def _coverage(levels: Pixels) -> Singles:
     """(H, W) about 0 on the ground, and about 1 on tokens, each by its own level."""
     grey = cv2.GaussianBlur(levels, (3, 3), 0).astype(np.float32)
     light, noise = _light(grey)
-    contrast = MIN_CONTRAST if noise > 1.0 else _CLEAN
+    contrast = _CONTRAST if noise > 1.0 else _CLEAN
     least = max(contrast / 2.0, 4.0 * noise)
     differs = light - grey
     if np.count_nonzero(differs < -least) > np.count_nonzero(differs > least):  # a dark ground

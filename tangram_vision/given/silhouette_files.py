@@ -162,7 +162,9 @@ def _closed(shade: Shade) -> Shade:
     whole = cv2.drawContours(np.zeros_like(mask), contours, -1, 1, cv2.FILLED)
     if whole.sum() < _LINES * mask.sum():
         return shade
-    return replace(shade, cover=np.asarray(whole, np.float32))
+    # The outer edge keeps its levels.
+    within = cv2.erode(whole, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))
+    return replace(shade, cover=np.maximum(shade.cover, within.astype(np.float32)))
 
 
 def _traced(cover: Singles, unit: float) -> Area:

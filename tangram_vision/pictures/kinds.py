@@ -1,6 +1,6 @@
 """What a shape looks like: its moments, and how it covers short lines across its edges.
 
-Legend: as in levels.py; S kinds, F moments, M lines across edges, J samples on each. Everything
+Legend: as in seeing.py; S kinds, F moments, M lines across edges, J samples on each. Everything
 here is in pixels, x to the right and y up, in the body frame of a shape.
 """
 

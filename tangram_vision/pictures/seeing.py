@@ -1,9 +1,12 @@
-"""One picture -> where each token of a known set lies, on which side, and whether that is sure.
+"""Coverage by tokens -> where each of a known set lies, on which side, and whether that is sure.
 
 Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
 All tokens are known, so what explains one blob leaves less for the others: all are explained
 together. Tokens that look alike come in any order. Who looked before need not find again what has
 not moved.
+
+Legend of this package: P pixels along a side of a picture, K tokens, N blobs. Coverage is (P, P)
+float32, about 0 where a picture shows the ground and about 1 where it shows a token.
 """
 
 from collections import Counter
@@ -14,18 +17,16 @@ from itertools import combinations
 
 import numpy as np
 
-from tangram_core.arrays import Complex, Floats, Ints, Pixels, Singles
+from tangram_core.arrays import Complex, Floats, Ints, Singles
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.sight.perception import Look
 from tangram_sim.targets.connected import MAX_PILE
 from tangram_vision.pictures.blobs import Blobs, find_blobs, likeness
 from tangram_vision.pictures.edges import refined
 from tangram_vision.pictures.kinds import Kind, kinds_of
-from tangram_vision.pictures.levels import coverage
 from tangram_vision.pictures.piles import Laid, arrangements, reaching_out
 from tangram_vision.pictures.ramps import fitted, ramps
 from tangram_vision.pictures.recalling import recalled
-from tangram_vision.pictures.samples import binary, settled
 
 _SMALLEST = 0.4  # of the smallest token: less is dirt
 _CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
@@ -49,29 +50,28 @@ class _Explained:
     doubtful: bool = False
 
 
-def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = None) -> Look:
-    """What a picture (P, P) of an arena shows of a layout's tokens.
+def see(cover: Singles, layout: Layout, arena: float, before: Look | None = None) -> Look:
+    """What a picture of an arena shows of a layout's tokens.
 
     Args:
-        picture: of all of them, and nothing else of their size.
+        cover: (P, P) share of each pixel that is covered, by all of them and by nothing else of
+            their size.
         layout: the tokens.
         arena: width of the picture.
         before: where those lay that are not told to have moved; None: nothing is known.
     """
-    pixels = len(picture)
+    pixels = len(cover)
     kinds = kinds_of(layout, arena, pixels)
-    cover = coverage(picture)
     poses, flipped = np.zeros((layout.tokens, 3)), np.zeros(layout.tokens, np.bool_)
     known, sure = np.zeros_like(flipped), np.zeros_like(flipped)
-    if cover is not None:
-        puzzle = _puzzle(cover, kinds, Counter({kind.shape: len(kind.tokens) for kind in kinds}))
-        left = {kind.shape: list(kind.tokens) for kind in kinds}
-        stayed = None if before is None else _stayed(puzzle, cover, before, arena)
-        for one in stayed or puzzle.explained():
-            for number, pose in zip(one.laid.kinds, one.laid.poses, strict=True):
-                token = left[kinds[number].shape].pop(0)
-                poses[token], flipped[token] = pose, kinds[number].flipped
-                known[token], sure[token] = True, not one.doubtful
+    puzzle = _puzzle(cover, kinds, Counter({kind.shape: len(kind.tokens) for kind in kinds}))
+    left = {kind.shape: list(kind.tokens) for kind in kinds}
+    stayed = None if before is None else _stayed(puzzle, cover, before, arena)
+    for one in stayed or puzzle.explained():
+        for number, pose in zip(one.laid.kinds, one.laid.poses, strict=True):
+            token = left[kinds[number].shape].pop(0)
+            poses[token], flipped[token] = pose, kinds[number].flipped
+            known[token], sure[token] = True, not one.doubtful
     unit = arena / pixels
     poses[known, :2] = (poses[known, :2] + (-pixels / 2.0, pixels / 2.0)) * unit
     poses[:, 2] = np.angle(np.exp(1j * poses[:, 2]))
@@ -81,7 +81,7 @@ def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = Non
 def _puzzle(cover: Singles, kinds: Sequence[Kind], left: Counter[int]) -> "_Puzzle":
     """What coverage (P, P) by so many tokens of each shape shows."""
     blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
-    return _Puzzle(blobs, kinds, left, binary(cover))
+    return _Puzzle(blobs, kinds, left)
 
 
 def _stayed(
@@ -128,7 +128,6 @@ class _Puzzle:
     blobs: Blobs
     kinds: Sequence[Kind]
     left: Counter[int]
-    sharp: bool
     _known: dict[tuple[int, tuple[int, ...]], list[_Explained]] = field(default_factory=dict)
     _tries: int = 0
 
@@ -261,9 +260,6 @@ class _Puzzle:
         poses, spread = refined(shapes, rough, blobs.cover, blobs.base[blob])
         best = _least(blob, spread)
         best = best[spread[best] < _ROUGH]
-        if self.sharp and len(best):
-            own = [shapes[row] for row in best.tolist()]
-            poses[best] = settled(own, poses[best], blobs.cover, blobs.base[blob[best]])
         return {
             int(blob[row]): _Explained(Laid((int(kind[row]),), poses[row : row + 1], 0.0))
             for row in best.tolist()

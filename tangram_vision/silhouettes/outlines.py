@@ -15,14 +15,12 @@ from dataclasses import dataclass
 from functools import reduce
 
 import contourpy
-import cv2
 import numpy as np
 import shapely
 from shapely import Polygon
 
 from tangram_core.arrays import Complex, Floats, Singles
 from tangram_sim.geometry.areas import Area
-from tangram_vision.pictures.samples import binary
 
 _MARGIN = 3  # pixels around a picture
 _SHORT = 10  # points of a chain that is no silhouette's
@@ -43,33 +41,18 @@ class Way:
         spread: pixels that points lie off their side.
         cost: of one more side, in squares of points' spreads.
         grid: whether sides are turned to multiples of 45 degrees to each other.
-        blur: pixels, of the picture before.
     """
 
     spread: float
     cost: float
     grid: bool
-    blur: float = 0.0
 
 
 # The ways that are tried, the one that is mostly right first.
-GREY_WAYS = tuple(
+WAYS = tuple(
     Way(spread, cost, grid)
     for spread, cost in ((0.06, 14.0), (0.06, 8.0), (0.1, 14.0), (0.06, 25.0), (0.15, 20.0))
     for grid in (True, False)
-)
-# Blurred, the steps of binary pictures become less, and corners rounder.
-BINARY_WAYS = tuple(
-    Way(spread, cost, grid, blur)
-    for grid, blur in ((True, 0.7), (False, 0.7), (True, 0.0))
-    for spread, cost in (
-        (0.2, 5.0),
-        (0.32, 9.0),
-        (0.15, 5.0),
-        (0.32, 5.0),
-        (0.32, 16.0),
-        (0.25, 9.0),
-    )
 )
 
 
@@ -99,14 +82,9 @@ class _Side:
         return self.middle + self.along * ((point - self.middle) * self.along.conjugate()).real
 
 
-def ways_of(cover: Singles) -> Sequence[Way]:
-    """The ways in which coverage (P, P) may be outlined, the best one first."""
-    return BINARY_WAYS if binary(cover) else GREY_WAYS
-
-
 def outline(cover: Singles, way: Way) -> Area:
     """The outline of the silhouette that coverage (P, P) shows; empty if it is too rugged."""
-    every = _chains(cover, way.blur)
+    every = _chains(cover)
     if sum(map(len, every)) > _MOST:
         return Polygon()
     rings = [_sides(z, way) for z in every]
@@ -123,12 +101,10 @@ def outline(cover: Singles, way: Way) -> Area:
     return reduce(shapely.symmetric_difference, polygons, Polygon())
 
 
-def _chains(cover: Singles, blur: float) -> list[Complex]:
+def _chains(cover: Singles) -> list[Complex]:
     """The closed chains of points (n,) where coverage (P, P) is a half."""
     # What reaches the picture's edge ends there.
     room = np.pad(cover, _MARGIN)
-    if blur:
-        room = np.asarray(cv2.GaussianBlur(room, (0, 0), blur), np.float32)
     lines = contourpy.contour_generator(z=room).lines(0.5)
     corner = complex(_MARGIN - 0.5, 0.5 - _MARGIN)
     every: list[Complex] = [np.asarray(line) @ np.array([1.0, -1j]) - corner for line in lines]

@@ -30,9 +30,8 @@ from tangram_sim.geometry.layout import Layout
 from tangram_vision.pictures.contacts import touching
 from tangram_vision.pictures.kinds import Kind, kinds_of
 from tangram_vision.pictures.ramps import fitted, ramps
-from tangram_vision.pictures.samples import binary
 from tangram_vision.silhouettes.beams import Beam
-from tangram_vision.silhouettes.outlines import Way, outline, ways_of
+from tangram_vision.silhouettes.outlines import WAYS, Way, outline
 from tangram_vision.silhouettes.silhouettes import (
     SOLVED,
     TOLERANCES,
@@ -94,7 +93,7 @@ def fill_picture(
         iou = _overlap(best, crop)
         found = _moved(best.found, corner * unit)
         return Filled(found, iou, time.thread_time() - begin, nodes, False, by=best.by)
-    area, late = explainer.outlined(ways_of(crop)[0]), Budget(begin + seconds)
+    area, late = explainer.outlined(WAYS[0]), Budget(begin + seconds)
     laid, iou = nearest_fill(area, layout, late, explainer.attempts, method)
     attempt = None if laid is None else _moved(laid, corner * unit)
     return Filled(None, iou, time.thread_time() - begin, nodes, False, attempt)
@@ -128,7 +127,7 @@ class _Explainer:
     def run(self, budget: Budget) -> None:
         """Until pixels are alike, or the budget is spent."""
         self.budget = budget
-        for way in ways_of(self._cover):
+        for way in WAYS:
             area, before = self.outlined(way), self.best
             if self._method.search and self._search(area):
                 return
@@ -227,11 +226,9 @@ def _wrong(best: _Explained, cover: Singles) -> Floats:
 
 
 def _overlap(best: _Explained, cover: Singles) -> float:
-    """Intersection over union of tokens and coverage (P, P), which is sharp or grey at edges."""
+    """Intersection over union of tokens and coverage (P, P)."""
     drawn = np.minimum(ramps(best.kinds, best.poses, len(cover)).sum(axis=0), 1.0)
     seen = np.clip(cover, 0.0, 1.0)
-    if binary(cover):
-        drawn = np.round(drawn)
     return float(np.minimum(drawn, seen).sum() / np.maximum(drawn, seen).sum())
 
 

@@ -49,7 +49,6 @@ AGENTS = {
         "tokens=large_triangle",  # a square is seen alike at four angles: rounding chooses one
         "sim.observe=pictures",
         "sim.pixels=64",
-        "sim.picture=grey",
     ),
 }
 pytestmark = pytest.mark.slow

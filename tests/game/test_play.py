@@ -59,7 +59,7 @@ def shown(config: PlayConfig) -> Show:
 
 # What the camera sees beside it
 
-OBSERVED = {"observe": "pictures", "pixels": 64, "picture": "grey"}
+OBSERVED = {"observe": "pictures", "pixels": 64}
 
 
 def test_the_cameras_view_stands_beside_the_table(tmp_path: Path) -> None:

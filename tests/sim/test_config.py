@@ -67,12 +67,6 @@ REFUSED = [
     (SimConfig, {"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
     (SimConfig, {"pixels": 15}, "sim.pixels must be 0 or at least 16, got 15"),
     (SimConfig, {"observe": "pictures"}, "^sim.observe=pictures needs .*: set sim.pixels=128$"),
-    (
-        SimConfig,
-        {"observe": "pictures", "picture": "grey"},
-        "^sim.observe=pictures needs .*: set sim.pixels=128$",
-    ),
-    (SimConfig, {"pixels": 64, "picture": "x"}, "^sim.picture must be one of binary, grey, got"),
     (SimConfig, {"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
     (SimConfig, {"motion": "slide", "backend": "kinematic"}, "needs .* got sim.backend=kinematic"),
     (SimConfig, {"motion": "slide", "allow_flip": True}, "allow_flip=true needs sim.motion=lift"),

@@ -95,7 +95,7 @@ def test_the_same_pictures_give_the_same_episodes(
 
 
 def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
-    task = setup("square", pixels=128, picture="grey")
+    task = setup("square", pixels=128)
     with closing(task.task.make(4)) as own:
         env = own.world
         env.reset([np.random.default_rng(i) for i in range(4)])
@@ -128,7 +128,7 @@ def test_alike_tokens_are_moved_where_they_are_seen() -> None:
 
 
 def test_what_is_missing_travels_and_is_not_learned_from() -> None:
-    task = at_random(setup("square"))
+    task = at_random(setup("small_triangle", actions_per_token=5))
     episodes = played(task, Policy(task), 4)
     spec = task.spec
     frames = EpisodeBatch(1, 0, episodes).encode(spec)

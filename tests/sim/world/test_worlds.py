@@ -151,7 +151,7 @@ def test_pictures_show_pixel_centres(
 
 
 def test_a_grey_pixel_is_as_dark_as_it_is_covered(make: WorldMaker) -> None:
-    world = make(layout_of("square"), pixels=20, picture="grey")  # a pixel is 0.1 wide
+    world = make(layout_of("square"), pixels=20, observe="pictures")  # a pixel is 0.1 wide
     world.place(np.array([[0.625 + 1e-6, 0.3 + 1e-6, 0.0]]))
     picture = world.picture().astype(int)
     covered = np.zeros((20, 20))
