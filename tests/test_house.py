@@ -148,12 +148,14 @@ def test_the_lock_has_all_that_is_required_each_file_by_its_hash() -> None:
         assert one.specifier.contains(versions[canonicalize_name(one.name)]), f"{one}: make lock"
 
 
-def test_every_file_of_conf_is_package_data() -> None:
+def test_every_file_that_is_no_code_is_package_data() -> None:
     patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
         "package-data"
-    ]["conf"]
-    packed = {path for pattern in patterns for path in (ROOT / "conf").glob(pattern)}
-    assert packed == set((ROOT / "conf").rglob("*.yaml"))
+    ]
+    packed = {p for name, own in patterns.items() for one in own for p in (ROOT / name).glob(one)}
+    every = {path for name in PACKAGES for path in (ROOT / name).rglob("*.*") if path.is_file()}
+    data = {p for p in every if p.suffix not in (".py", ".pyc") and p.name != "README.md"}
+    assert packed == data
 
 
 # The Makefile

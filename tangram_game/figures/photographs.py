@@ -6,7 +6,6 @@ from pathlib import Path
 from PIL import Image
 
 from tangram_core.arrays import Floats
-from tangram_core.errors import ConfigError
 from tangram_game.figures.puzzles import Figure, check_inside
 from tangram_game.show.views import outlined
 from tangram_sim.drawing.scenes import contact_sheet
@@ -30,25 +29,23 @@ class Photograph:
     figure: Figure
 
 
-def read_photograph(target: str, task: Place) -> Photograph:
-    """What a file shows of a run's tokens.
+def read_photograph(target: str, task: Place, anywhere: bool = False) -> Photograph:
+    """What a file shows of a run's tokens, in its arena or anywhere.
 
     Raises:
-        ConfigError: says what was found instead, or that OpenCV is not installed.
+        ConfigError: says what was found instead.
     """
-    try:
-        # Only here: other targets need no OpenCV.
-        from tangram_vision.given.photos import find_tokens  # noqa: PLC0415
-        from tangram_vision.given.picture_files import read_picture  # noqa: PLC0415
-    except ImportError as error:  # also a library that OpenCV needs in its turn
-        raise ConfigError(
-            f"target needs OpenCV ({error}): install opencv-python-headless, or leave target out"
-        ) from error
+    # Only here: other targets need no OpenCV. Without it nothing is a photograph.
+    from tangram_vision.given.photos import find_tokens  # noqa: PLC0415
+    from tangram_vision.given.picture_files import read_picture  # noqa: PLC0415
+
     source, layout = f"target={target}", task.layout
     picture = read_picture(Path(target), source)
     found = find_tokens(picture, layout, source)
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
-    check_inside(source, task, layout.corners(poses, found.flipped), "lay tokens nearer together")
+    if not anywhere:
+        remedy = "lay tokens nearer together, or write out=solution.json, which needs no arena"
+        check_inside(source, task, layout.corners(poses, found.flipped), remedy)
     outlines = layout.corners(found.poses, found.flipped) * (found.unit, -found.unit)
     return Photograph(picture, outlines, Figure(Path(target).stem, 0.0, poses, found.flipped))
 

@@ -69,10 +69,7 @@ def find_figures(
         ConfigError: a file that cannot be used, an unknown name, or pieces that are not the tokens.
     """
     puzzles = _named(_read(source, task.tokens.scale), names, source)
-    figures = tuple(figure for puzzle in puzzles for figure in _turns(puzzle, task, turns))
-    if not figures:
-        raise ConfigError(f"{source or 'the library'} has no puzzle to play")
-    return figures
+    return tuple(figure for puzzle in puzzles for figure in _turns(puzzle, task, turns))
 
 
 def by(actor: Actor) -> Player:

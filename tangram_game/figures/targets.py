@@ -44,7 +44,7 @@ def told_apart(target: str, task: Place) -> str:
     except ImportError:
         return SILHOUETTE  # whose reader says what is missing
     try:
-        read_photograph(target, task)
+        read_photograph(target, task, anywhere=True)
     except LackingError as error:
         if error.areas > MOST_PARTS:
             raise ConfigError(f"{error}; or set silhouette={target} if it is one figure") from None
@@ -71,7 +71,7 @@ def solved(target: str, source: str, task: Place, kind: str) -> "Solution":
         return answered(target, source, task).solution(layout, scale, target)
     from tangram_vision.solution import Picture, Solution, tokens_of  # noqa: PLC0415
 
-    seen = read_photograph(target, task)
+    seen = read_photograph(target, task, anywhere=True)
     lies = Dissection(seen.figure.poses, seen.figure.flipped)
     return Solution(
         source=target,

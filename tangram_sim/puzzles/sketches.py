@@ -60,9 +60,11 @@ def read_text(path: Path, source: str | None = None) -> str:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise ConfigError(f"{source} cannot be read ({error.strerror})") from None
+        raise ConfigError(
+            f"{source} cannot be read ({error.strerror}): give a copy that you may read"
+        ) from None
     if len(content) > MAX_BYTES:
-        raise ConfigError(f"{source} is larger than {MAX_BYTES} bytes: split it")
+        raise ConfigError(f"{source} is larger than {MAX_BYTES} bytes: split it, or give a PNG")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -95,7 +97,7 @@ def loaded(text: str, source: str) -> Any:
         raise ConfigError(f"{source}: {fault}") from None
     except (ValueError, RecursionError) as error:
         place = (
-            f"line {error.lineno}"
+            f"line {error.lineno}{' and the one before' * (error.lineno > 1)}"
             if isinstance(error, json.JSONDecodeError)
             else "its nesting and numbers"
         )

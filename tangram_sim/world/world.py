@@ -110,6 +110,6 @@ def no_opencv(why: str) -> ConfigError:
 
 def _no_engine(why: str) -> ConfigError:
     return ConfigError(
-        f"sim.backend=physics needs PyBullet ({why}): install pybullet, or set "
-        "sim.backend=kinematic"
+        f"sim.backend=physics needs PyBullet ({why}): install pybullet, from Python 3.12 on "
+        "pybullet-arm64, or set sim.backend=kinematic"
     )

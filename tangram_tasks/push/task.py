@@ -200,7 +200,10 @@ class Push(Task):
         for seed in range(DRAWS):
             begin(self.layout, self.count, np.random.default_rng(seed), self.figures)
         if plays and find_spec("pybullet") is None:
-            raise ConfigError("task=push needs PyBullet, which is missing: pip install pybullet")
+            raise ConfigError(
+                "task=push needs PyBullet, which is missing: pip install pybullet, from Python "
+                "3.12 on pybullet-arm64"
+            )
         if plays and self.config.pixels and find_spec("cv2") is None:
             raise ConfigError(
                 f"task.pixels={self.config.pixels} needs OpenCV, which is missing: pip install "

@@ -44,7 +44,7 @@ _NOTHING = "no token alone"
 
 
 class LackingError(ConfigError):
-    """Not all tokens were found.
+    """Not all tokens were found, or they are too small.
 
     Attributes:
         areas: that were seen apart.
@@ -87,9 +87,10 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
     unit = float(np.sqrt(spots.cover.sum() / layout.areas.sum()))
     smallest = float(np.sqrt(layout.areas.min()) * unit)
     if smallest < _SMALL:
-        raise ConfigError(
+        raise LackingError(
             f"{source} shows tokens too small: the smallest is about {smallest:.1f} pixels wide, "
-            f"and {_SMALL:g} are needed: take it from nearer, or larger"
+            f"and {_SMALL:g} are needed: take it from nearer, or larger",
+            len(spots.boxes),
         )
     part, corner = spots.cut_out()
     view = len(part) / unit
@@ -146,7 +147,7 @@ def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":
         raise ConfigError(
             f"{source} shows nothing{at_edge} that is darker or lighter than its ground by "
             f"{_CLEAN} of 255 levels, {_CONTRAST} where that is uneven: take it with dark "
-            "tokens on light ground, or light ones on dark"
+            "tokens on light ground, or light ones on dark, and with ground all around"
         )
     return spots
 

@@ -16,7 +16,6 @@ FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "TIFF", "BMP", "AVIF", "PPM")
 READ = (
     *(".png", ".jpg", ".jpeg", ".webp", ".gif", ".tif", ".tiff", ".bmp", ".avif", ".ppm", ".svg"),
 )
-SUFFIXES = (*READ, ".heic", ".heif", ".pdf")  # the last are refused, and told as what
 MAX_MEGAPIXELS = 64
 MIN_SIDE = 32
 LONGEST = 1280  # pixels of the longer side that are looked at
@@ -50,7 +49,7 @@ def read_picture(path: Path, source: str) -> Image.Image:
         raise ConfigError(_too_large(source)) from None
     except _BROKEN as error:
         why = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"
-        kind = path.suffix[1:].upper() if path.suffix.lower() in SUFFIXES else "picture"
+        kind = path.suffix[1:].upper() or "picture"
         raise ConfigError(
             f"{source} is no {kind} that can be read{why}: save it anew as PNG or JPEG"
         ) from None

@@ -24,7 +24,7 @@ from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_vision.given.outline_files import Drawn, read_outline
 from tangram_vision.given.photos import Shade, find_silhouette
-from tangram_vision.given.picture_files import SUFFIXES, read_picture
+from tangram_vision.given.picture_files import read_picture
 from tangram_vision.silhouettes.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes.silhouettes import (
     UNLEARNED,
@@ -88,7 +88,7 @@ def fill_silhouette(
         ConfigError: a file that cannot be used; whether it was filled is not checked.
     """
     path = Path(name)
-    if path.suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() in ("", ".json"):
         return _from_outline(read_outline(name, source), layout, scale, seconds, method)
     return _from_picture(read_picture(path, source), source, layout, seconds, method)
 
@@ -143,15 +143,15 @@ def _from_picture(
 ) -> Silhouette:
     """The scale is that at which as many pixels are covered as the tokens are large."""
     shade = _closed(find_silhouette(picture, layout, source))
+    if not (shade.cover > 0.5).any():
+        raise ConfigError(
+            f"{source} shows lines that are too thin to have an area: fill the figure with one tone"
+        )
     share = float(shade.cover.sum()) / shade.cover.size
     view = float(np.sqrt(layout.areas.sum() / share))
     filled = fill_picture(shade.cover, layout, view, seconds, method)
     drawing = shade.back @ np.diag([1.0 / view, -1.0 / view, 1.0])
     area = _traced(shade.cover, view / len(shade.cover))
-    if not area.area > 0.0:
-        raise ConfigError(
-            f"{source} shows lines that are too thin to have an area: fill the figure with one tone"
-        )
     return Silhouette(picture, _shaded(shade, picture.size), filled, drawing, area)
 
 

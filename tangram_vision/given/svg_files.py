@@ -93,7 +93,8 @@ def _drawn(text: str, source: str) -> AnyArray:
                 f"{source} needs resvg, which is missing: pip install resvg-py"
             ) from None
         raise ConfigError(
-            f"{source} takes more than {SECONDS} s or {BYTES >> 30} GB to draw: simplify it"
+            f"{source} cannot be drawn in {SECONDS} s and {BYTES >> 30} GB: take away its filters "
+            "and groups within groups, or give a PNG of it"
         ) from None
     drawn: AnyArray = np.asarray(Image.open(BytesIO(done.stdout)).convert("RGBA"))
     return drawn
@@ -133,19 +134,26 @@ def _checked(text: str, source: str) -> ET.Element:
         ConfigError: it is no SVG, or is drawn otherwise elsewhere, as text is by other fonts.
     """
     if re.search(r"<!\s*(doctype[^<>]*\[|entity)", text, re.IGNORECASE):
-        raise ConfigError(f"{source} must have no ENTITY and no DOCTYPE with [...]: delete them")
+        raise ConfigError(
+            f"{source} must have no ENTITY and no DOCTYPE with [...]: write out what each &name; "
+            "stands for, then delete them, or give a PNG of it"
+        )
     try:
         # Entities are the danger of XML, and none can be defined without a [...] of DOCTYPE.
         root = ET.fromstring(text)  # noqa: S314
     except (ET.ParseError, ValueError) as error:
-        raise ConfigError(f"{source} is not XML: {error}") from None
+        raise ConfigError(
+            f"{source} is not XML ({error}): save it anew as SVG, or give a PNG of it"
+        ) from None
     tags = [str(element.tag).rpartition("}")[2] for element in root.iter()]
     if tags[0] != "svg":
-        raise ConfigError(f"{source} must be an <svg> element, got <{tags[0]}>")
+        raise ConfigError(f"{source} is no <svg> but a <{tags[0]}>: save the <svg> in it alone")
     for tag in _REFUSED.keys() & {*tags}:
         raise ConfigError(f"{source} has an element <{tag}>: {_REFUSED[tag]}")
     styles = [one.get("style", "") for one in root.iter()]
     styles += [one.text or "" for one in root.iter() if str(one.tag).endswith("style")]
     if any(re.search(r"(?<![-\w])transform\s*:(?!\s*none)", style) for style in styles):
-        raise ConfigError(f"{source} has a style with a transform: write it as an attribute")
+        raise ConfigError(
+            f"{source} has a style with a transform: write it as an attribute, without px and deg"
+        )
     return root

@@ -75,29 +75,17 @@ def test_without_a_side_nothing_is_said_of_the_area(tmp_path: Path) -> None:
 
 
 WRONG = {
-    '{"format": "tangram-outlines"}': "it must be a mapping with the keys format, version, outl",
-    '{"outlines": [], "format": "tangram-outlines", "version": 2}': "version must be 1, got 2",
-    '{"outlines": [], "format": "mine", "version": 1}': "format must be 'tangram-outlines', got",
-    f'{TOP}[], "title": 1}}': "must be a mapping with the keys",
     f"{TOP}{{}}}}": r"outlines must be a list of 1 to 100, got \{\}",
-    f"{TOP}{[SQUARE] * 101}}}": "outlines must be a list of 1 to 100, got 101",
-    f"{TOP}[[[0, 0], [1, 1]]]}}": "outline 1 must be a list of 3 to 2000 corners, got 2",
     f"{TOP}{[ring(10_000).tolist()]}}}": "outline 1 must be a list of 3 to 2000 corners, got 100",
-    f"{TOP}{[ring(1_001).tolist()] * 2}}}": "more than 2000 corners",
     f"{TOP}[{SQUARE}, [[0, 0], [NaN, 1], [1, 1]]]}}": r"outline 2: a corner must be \[x, y\], fin",
     f"{TOP}[[[0, 0], [1, 1e999], [1, 1]]]}}": r"finite and within \+-1e\+06",
     f"{TOP}[[[0, 0], [1, {'9' * 5000}], [1, 1]]]}}": "is not JSON that can be read",
     f"{TOP}[[[0, 0], [1, true], [1, 1]]]}}": "outline 1: a corner must be",
-    f'{TOP}[{SQUARE}], "side": 0}}': "side must be a number from 1e-06 to 1e.06, got 0",
     f'{TOP}[{SQUARE}], "side": NaN}}': "side must be a number",
-    f'{TOP}[{SQUARE}], "side": 1, "side": 2}}': "a key is given twice",
-    f"{TOP}[[[0, 0], [1, 1], [2, 2]]]}}": "draws nothing that has an area",
     f"{TOP}{np.random.default_rng(0).random((1, 200, 2)).tolist()}}}": "meet more than 1000 times",
     f"{TOP}{[comb(240).tolist(), comb(240)[:, ::-1].tolist()]}}}": "meet more than 1000 times",
     f"{TOP}{[[[x, 0] for x in np.random.default_rng(0).random(400).tolist()]]}}}": "meet more than",
     "[" * 1_000_000: "is not JSON that can be read",
-    " " * (4 * 2**20 + 1): "is larger than 4194304 bytes",
-    "7": "must be a mapping with exactly the keys format, version, puzzles",
 }
 
 

@@ -13,7 +13,6 @@ from tangram_agent.runs import load_run
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_game.config import PlayConfig
-from tangram_game.figures.photographs import read_photograph
 from tangram_game.play import play_run
 from tangram_sim.drawing.strokes import colour_of
 from tangram_sim.geometry.layout import Layout
@@ -116,7 +115,6 @@ def crowd() -> Floats:
 
 REFUSED = {
     "nothing": (np.full((200, 300), 200.0), "shows nothing that is darker or lighter than its "),
-    "faint": (levels(LAYOUT, POSES, 200, 192), "shows nothing that is .* by 12 of 255 levels, 40 "),
     "crowd": (crowd(), f"shows more than 40 areas, and the run moves {NAMES}: lay them all "),
     "one": (
         levels(layout_of("square"), POSES[:1]),
@@ -126,15 +124,10 @@ REFUSED = {
         levels(LAYOUT, POSES + (1.0, 0.0, 0.0)),
         rf"shows 2 areas \(1 more at its edge .*the run moves {NAMES} .not found: .*.: lay",
     ),
-    "small": (
-        levels(LAYOUT, POSES)[::24, ::24].repeat(4, 0).repeat(4, 1),
-        "shows tokens too small",
-    ),
     "dirt": (
         np.random.default_rng(0).integers(0, 256, (600, 600)).astype(np.float64),
         r"shows .* areas \(.*\), by shape no token alone, and the run moves",
     ),
-    "tiny": (np.zeros((20, 400)), "has 400 x 20 pixels, and at least 32 along each side are "),
 }
 
 
@@ -152,8 +145,6 @@ def test_files_that_are_no_pictures_are_refused(tmp_path: Path) -> None:
     photo(whole, levels(LAYOUT, POSES))
     large = [b"IHDR" + struct.pack(">II", side, side) + b"\1\0\0\0\0" for side in (9000, 20000)]
     for content, expected in (
-        (None, "is no file: check the path"),
-        (b"no picture", "is no PNG that can be read: save it anew as PNG or JPEG"),
         (whole.read_bytes()[:-600], r"is no PNG that can be read \(.+\): save it anew"),
         *(
             (
@@ -163,8 +154,7 @@ def test_files_that_are_no_pictures_are_refused(tmp_path: Path) -> None:
             for head in large
         ),
     ):
-        if content is not None:
-            path.write_bytes(content)
+        path.write_bytes(content)
         with pytest.raises(ConfigError, match=f"^target=it {expected}"):
             found(path)
 
@@ -185,14 +175,6 @@ def test_what_was_seen_is_drawn_before_the_film(tmp_path: Path) -> None:
         box = np.ptp(rows) * np.ptp(columns)
         assert 0 < near.sum() < box / 4
     assert sizes[1][0] > 2 * sizes[0][0]
-
-
-def test_tokens_must_lie_within_the_arena(tmp_path: Path) -> None:
-    task = load_run("pretrained/square").task
-    target = photo(tmp_path / "it.png", levels(task.layout, POSES[:1]))
-    near = task.with_sim(arena=0.4)
-    with pytest.raises(ConfigError, match="it.png reaches 0.262 .*only 0.2: lay "):
-        read_photograph(target, near)
 
 
 def test_a_photograph_is_instead_of_other_targets() -> None:

@@ -138,15 +138,12 @@ def test_an_agent_of_outlines_fills_what_a_picture_shows(filler: Path, tmp_path:
     assert out.exists()
 
 
-def test_a_puzzle_file_of_one_is_filled_and_one_of_more_is_refused(tmp_path: Path) -> None:
+def test_a_puzzle_file_of_one_is_filled(tmp_path: Path) -> None:
     content = json.loads((PACKAGED / "test.json").read_text())
-    for count in (1, 2):
-        some = content | {"puzzles": content["puzzles"][:count]}
-        (tmp_path / f"{count}.json").write_text(json.dumps(some))
+    one = content | {"puzzles": content["puzzles"][:1]}
+    (tmp_path / "1.json").write_text(json.dumps(one))
     shown = read_silhouette(str(tmp_path / "1.json"), "it", load_run("pretrained/tangram7").task)
     assert float(shown.told.split()[-1]) > 0.97
-    with pytest.raises(ConfigError, match="has 2 puzzles, and one silhouette is filled"):
-        read(str(tmp_path / "2.json"))
 
 
 def test_a_file_is_named_from_where_the_command_was_started(
@@ -174,19 +171,6 @@ def test_a_figure_that_is_cut_off_is_refused(tmp_path: Path) -> None:
     both.save(tmp_path / "both.png")
     with pytest.raises(ConfigError, match="is cut off: a part of it reaches the picture's edge"):
         read(str(tmp_path / "both.png"))
-
-
-@pytest.mark.parametrize("kind", ["heic", "pdf"])
-def test_a_kind_of_picture_that_is_not_read_is_named(tmp_path: Path, kind: str) -> None:
-    (tmp_path / f"it.{kind}").write_bytes(b"%PDF-1.7")
-    with pytest.raises(ConfigError, match=f"is no {kind.upper()} that can be read: save it anew"):
-        read(str(tmp_path / f"it.{kind}"))
-
-
-def test_a_picture_of_nothing_is_refused(tmp_path: Path) -> None:
-    Image.new("L", (200, 200), 235).save(tmp_path / "nothing.png")
-    with pytest.raises(ConfigError, match=r"it shows nothing"):
-        read(str(tmp_path / "nothing.png"))
 
 
 def test_what_fills_a_picture_badly_does_not_fill_it(

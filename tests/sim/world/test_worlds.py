@@ -264,7 +264,7 @@ def test_a_missing_engine_is_named_also_before_a_world_is_made(
         make_world(layout_of("square"), SimConfig())
     monkeypatch.setattr(world_module, "find_spec", lambda name: None)
     check_world(layout_of("square"), SimConfig(backend="kinematic"))
-    with pytest.raises(ConfigError, match=r"needs PyBullet .*: install pybullet, or set"):
+    with pytest.raises(ConfigError, match=r"needs PyBullet .*: install pybullet, from .*, or set"):
         check_world(layout_of("square"), SimConfig())
     seen = SimConfig(backend="kinematic", observe="pictures", pixels=64)
     check_room(layout_of("square"), seen)  # a master looks at nothing
