@@ -23,6 +23,7 @@ WITH_HELP = (
     "tangram-keys",
     "tangram-eval",
     "tangram-play",
+    "tangram-export",
     "tangram-studio",
     "tangram-experiment",
     "tangram-report",
@@ -31,6 +32,7 @@ WITH_HELP = (
 SETTING = {
     "tangram-worker": "role: player",
     "tangram-keys": "add: null",
+    "tangram-export": "out: runs/agent.onnx",
     "tangram-studio": "port: 8765",
     "tangram-experiment": "jobs: 2",
     "tangram-report": "runs: null",
