@@ -131,8 +131,7 @@ def _over_text(command: Command) -> Iterator[str]:
     yield ""
     sections = ", ".join(command.over)
     yield f"Besides, settings of {sections} in place of what the run was trained with, as in"
-    yield "sim.starts=outside agent.reapply=1. What was for learning only, or is built into the"
-    yield "weights, is refused."
+    yield "agent.reapply=1. What was for learning only, or is built into the weights, is refused."
 
 
 def _setting_lines(command: Command) -> Iterator[str]:

@@ -96,8 +96,8 @@ class Actor(ABC):
             ConfigError: it is more than a network, as a search is.
         """
         raise ConfigError(
-            f"a {type(self).__name__} decides by a search, which is no network: play it by "
-            "tangram_agent.runs.load_run, as docs/inference.md has it"
+            f"{type(self).__name__} is more than a network: it searches, or has no graph() of its "
+            "own: play it by tangram_agent.runs.load_run, as docs/inference.md has it"
         )
 
 

@@ -79,7 +79,7 @@ def test_an_agent_plays_alike(
 
 @pytest.mark.parametrize("name", ["hand", "tangram7_silhouette"])
 def test_who_searches_is_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="Actor decides by a search, .* play it by"):
+    with pytest.raises(ConfigError, match="Actor is more than a network: .* play it by"):
         export.export_run(ExportConfig(f"pretrained/{name}", str(tmp_path / "agent.onnx")))
 
 
