@@ -79,18 +79,24 @@ def exported(run: Run) -> bytes:
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder, torch.no_grad():
         warnings.simplefilter("ignore")  # of torch, at its own code
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        made = torch.onnx.export(
-            network,
-            (),
-            kwargs={"seen": seen},
-            input_names=names,
-            output_names=(OUTPUT,),
-            dynamic_shapes={"seen": dict.fromkeys(names, rows)},
-            opset_version=OPSET,
-            dynamo=True,
-            optimize=False,  # onnxruntime does, when it loads it; here it takes half the time
-            verbose=False,
-        )
+        try:
+            made = torch.onnx.export(
+                network,
+                (),
+                kwargs={"seen": seen},
+                input_names=names,
+                output_names=(OUTPUT,),
+                dynamic_shapes={"seen": dict.fromkeys(names, rows)},
+                opset_version=OPSET,
+                dynamo=True,
+                optimize=False,  # onnxruntime does, when it loads it; here it takes half the time
+                verbose=False,
+            )
+        except torch.onnx.errors.OnnxExporterError as error:
+            why = str(error.__cause__ or error).strip().splitlines()[0]
+            raise RunError(
+                f"{run.folder} cannot be written as ONNX: {why}: make graph() of other operations"
+            ) from error
         path = Path(folder) / "agent.onnx"
         made.save(path)
         model = onnx.load(path)

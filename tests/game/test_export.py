@@ -83,6 +83,17 @@ def test_who_searches_is_refused(name: str, tmp_path: Path) -> None:
         export.export_run(ExportConfig(f"pretrained/{name}", str(tmp_path / "agent.onnx")))
 
 
+def test_what_onnx_does_not_know_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Odd(torch.nn.Module):
+        def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+            return seen["observation"].sort(dim=1, stable=True).values
+
+    own = run(toy("td3"))
+    monkeypatch.setattr(own.actor, "graph", Odd)
+    with pytest.raises(RunError, match="runs/one cannot be written as ONNX: .*sort.*: make graph"):
+        export.exported(own)
+
+
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tangram_game.config.find_spec", lambda name: name == "onnx" or None)
     with pytest.raises(ConfigError, match="pip install onnxscript onnxruntime$"):

@@ -81,15 +81,15 @@ class Planner(nn.Module):
         """
         untraced()
         scene, rows = self._scene(corners, goals), torch.arange(corners.shape[0])[:, None]
-        which = torch.arange(self.token.shape[0]).expand(corners.shape[0], -1)  # (B, N)
+        which, allowed = self._candidates(placed)
         pairs = self._pairs(scene, rows, which, self.piece[which])
         pose = self._proposed(pairs)
         several = self.token.shape[0] > 1
         if several:
             value = self._valued(pairs, pose).view(which.shape)
-            value = torch.where(self._allowed(placed), value, -torch.inf)
-            own, which = value.topk(min(_SHORT_LIST, value.shape[1]))
-            pose = pose.view(*value.shape, 3)[rows, which].flatten(0, 1)
+            value = torch.where(allowed, value, -torch.inf)
+            own, at = value.topk(min(_SHORT_LIST, value.shape[1]))
+            which, pose = which.gather(1, at), pose.view(*value.shape, 3)[rows, at].flatten(0, 1)
             pairs = self._pairs(scene, rows, which, self.piece[which])
         for _ in range(self._reapply):
             pose = self._proposed(pairs.at(pose))
@@ -105,11 +105,20 @@ class Planner(nn.Module):
         shares = self._covered.shares(lying, wanted)
         return Scene(*_pose(*lying), *_pose(*wanted), *(one.float() for one in shares))
 
-    def _allowed(self, placed: Tensor) -> Tensor:
-        """(B, N) candidates whose token is open; of the first one, where none is."""
+    def _candidates(self, placed: Tensor) -> tuple[Tensor, Tensor]:
+        """Which candidates (B, N) there are, and whether they may be played.
+
+        Those whose token is open, the first token's where none is. In play only as many as a row of
+        them needs; where it is written down shapes hang on B alone.
+        """
         is_open = placed == 0
         first = torch.arange(self._tokens) == 0
-        return (is_open | (first & ~is_open.any(1, keepdim=True)))[:, self.token]
+        allowed = (is_open | (first & ~is_open.any(1, keepdim=True)))[:, self.token]
+        which = torch.arange(self.token.shape[0]).expand(allowed.shape)
+        if not torch.compiler.is_exporting():
+            which = (~allowed).int().argsort(dim=1, stable=True)[:, : int(allowed.sum(1).max())]
+            allowed = allowed.gather(1, which)
+        return which, allowed
 
     def _pairs(self, scene: Scene, rows: Tensor, which: Tensor, piece: Tensor) -> Pairs:
         """The pairs of candidates (B, N'), with pieces (B, N'), in a row."""
