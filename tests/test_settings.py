@@ -147,7 +147,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.algorithm": (GOAL, "ddpg"),
     "agent.hidden": (GOAL, [9]),
     "agent.learning_rate": (GOAL, 1e-2),
-    "agent.goals": (GOAL, ["next"]),
     "agent.relabel_share": (GOAL, 0.0),
     "agent.action_penalty": (GOAL, 1.0),
     "agent.actor_delay": (GOAL, 1),
