@@ -173,7 +173,7 @@ def _told(task: Place) -> str:
         f"{sim.actions_per_token} action{'s' * (sim.actions_per_token > 1)} a token",
         "exploration off",
         _observed(sim),
-        sim.backend if task.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
+        sim.backend,
     )
     return ", ".join(parts)
 

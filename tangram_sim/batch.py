@@ -40,10 +40,10 @@ class StepResult:
         overlap: (B,) raw overlap in [0, 1] on exact polygons.
         camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
         refused: (B,) where the action named a placed token: nothing moved.
-        blocked: (B,) where a lifted token could not be set down on others: nothing moved.
+        blocked: (B,) where the token could not be set down on others: nothing moved.
         tokens: (B,) which token moved, or would have.
-        covered: (B,) share of its area by which a lifted token was, or would have been, set down on
-            others; 0 for one that slides.
+        covered: (B,) share of its area by which the token was, or would have been, set down on
+            others.
         done: whether the episodes are over, all at once.
     """
 
@@ -80,7 +80,7 @@ class BatchedEnv:
     `actions_per_token` actions is placed, and once all are the episode is over for good. A lone
     token that has several actions is never placed: a time limit ends its episode, and it could as
     well go on. An action that names a placed token is refused: it moves nothing, but uses up its
-    step. One that would set a lifted token down on others by more than `MAX_OVERLAP` of its
+    step. One that would set a token down on others by more than `MAX_OVERLAP` of its
     area moves nothing either, and is one of the token's actions.
 
     Attributes:
@@ -258,9 +258,9 @@ class BatchedEnv:
             world.close()
 
     def _covered(self, tokens: Ints, velocity: Floats, flip: Bools) -> Floats:
-        """(B,) share of its area by which each lifted token would be set down on others."""
+        """(B,) share of its area by which each token would be set down on others."""
         layout, rows = self.layout, np.arange(self.count)
-        if layout.tokens == 1 or self.sim.motion != "lift":
+        if layout.tokens == 1:
             return np.zeros(self.count)
         poses, sides = self._poses.copy(), self._flipped.copy()
         poses[rows, tokens] += velocity

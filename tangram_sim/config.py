@@ -15,7 +15,6 @@ SOURCES = ("polygon", "camera")
 MIN_PIXELS = 16
 SILHOUETTE = "silhouette"  # what the target looks like without its pieces
 OBSERVED = ("corners", "pictures", SILHOUETTE)
-MOTIONS = ("lift", "slide")
 # Share of a token that may come to lie on others where it is set down: the engine pushes such
 # tokens apart by a little, and with more it would move what is placed.
 MAX_OVERLAP = 0.2
@@ -42,11 +41,6 @@ class SimConfig(Settings, section="sim"):
         "have filled by a search",
         choices=OBSERVED,
     )
-    motion: str = setting(
-        "lift",
-        "carried above the others and set down, or pushed along the table and others with it",
-        choices=MOTIONS,
-    )
     targets: str = setting(
         "uniform",
         "uniform: pieces apart, anywhere; connected: edge to edge; figures: puzzles of the train "
@@ -68,9 +62,7 @@ class SimConfig(Settings, section="sim"):
         low=0,
         high=1,
     )
-    allow_flip: bool = setting(
-        False, "starts on any side; an action may turn its token over (lift only)"
-    )
+    allow_flip: bool = setting(False, "starts on any side; an action may turn its token over")
     pixels: int = setting(
         0,
         "side of the camera's square pictures, from at least 16; 0: none are taken, but by "
@@ -100,16 +92,6 @@ class SimConfig(Settings, section="sim"):
         if self.looks:
             self._check_observed()
         super().__post_init__()
-        if self.motion == "slide" and self.backend == "kinematic":
-            raise ConfigError(
-                "sim.motion=slide needs the engine's contacts, got sim.backend=kinematic: set "
-                "sim.backend=physics, or sim.motion=lift"
-            )
-        if self.motion == "slide" and self.allow_flip:
-            raise ConfigError(
-                "sim.allow_flip=true needs sim.motion=lift, got slide: a token that stays on the "
-                "table cannot be turned over"
-            )
         if 0 < self.pixels < MIN_PIXELS:
             raise ConfigError(f"sim.pixels must be 0 or at least {MIN_PIXELS}, got {self.pixels}")
         if self.observe == "silhouette" and self.pixels:

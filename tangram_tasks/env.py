@@ -131,7 +131,7 @@ def make_eye(task: "Place") -> Eye | None:
         raise no_opencv(str(error)) from error
     layout, arena = task.layout, task.sim.arena
 
-    def look(picture: Pixels, before: Look | None = None) -> Look:
-        return see(coverage(picture), layout, arena, before)
+    def look(picture: Pixels) -> Look:
+        return see(coverage(picture), layout, arena)
 
     return look

@@ -74,7 +74,6 @@ class Fill(Place):
                 "task=place"
             )
         wanted: dict[str, object] = {
-            "motion": "lift",
             "starts": "outside",
             "actions_per_token": 1,
             "allow_flip": self.layout.any_chiral or sim.allow_flip,

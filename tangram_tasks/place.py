@@ -1,4 +1,4 @@
-"""Tokens are moved onto their target: one to seven of them, lifted or slid, by PyBullet or exactly.
+"""Tokens are moved onto their target: one to seven of them, by PyBullet or exactly.
 
 Legend: K tokens, V corners.
 """

@@ -49,7 +49,7 @@ def test_the_launcher_needs_no_torch() -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "eval episodes=3 sim.motion=fly",
+        "eval episodes=3 sim.targets=fly",
         "play puzzle=nowhere.json",
         "play target=nowhere.png",
         "play silhouette=nowhere.png",

@@ -66,15 +66,6 @@ OUTLINES = over(
     sim={"observe": "silhouette", "starts": "outside", "allow_flip": True},
 ) | {"agent": {"kind": "outline", **AGENT, "learning_starts": 2}}
 PHYSICS = over(ONE, sim={"backend": "physics"})
-# So crowded that nearly every order pushes something away.
-SLIDE = over(
-    SEVERAL,
-    tokens={
-        "shapes": ["large_triangle", "parallelogram", "square", "medium_triangle"],
-        "scale": 0.6,
-    },
-    sim={"backend": "physics", "motion": "slide", "arena": 1.6},
-)
 SEEN = over(ONE, sim={"pixels": 16, "arena": 1.2})
 CAMERA = over(SEEN, reward={"source": "camera"})
 NEAR = {"strategy": "near", "copies": 1, "position": 0.1, "angle": 0.1}
@@ -116,7 +107,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.backend": (SEVERAL, "physics"),
     "sim.arena": (ONE, 2.5),
     "sim.actions_per_token": (ONE, 2),
-    "sim.motion": (over(SEVERAL, sim={"backend": "physics"}), "slide"),
     "sim.targets": (SEVERAL, "connected"),
     "sim.starts": (SEVERAL, "outside"),
     "sim.mirrored": (SEVERAL, 1.0),
@@ -157,7 +147,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.algorithm": (GOAL, "ddpg"),
     "agent.hidden": (GOAL, [9]),
     "agent.learning_rate": (GOAL, 1e-2),
-    "agent.goals": (GOAL, ["next"]),
     "agent.relabel_share": (GOAL, 0.0),
     "agent.action_penalty": (GOAL, 1.0),
     "agent.actor_delay": (GOAL, 1),
@@ -321,7 +310,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (MLP, "net.init", "authors", "net.kind=mlp"),
         (ONE, "net.activation", "tanh", "net.kind=mha"),
         (ONE, "sim.view", 2.0, "sim.pixels=0"),
-        (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from tangram_core.errors import ConfigError
 from tangram_core.settings import LEARNING, NETWORK, Settings, setting
 
-GOALS = ("future", "next", "final")
-
 
 @dataclass(frozen=True)
 class EpisodeConfig(Settings, section="agent"):
@@ -29,15 +27,13 @@ class EpisodeConfig(Settings, section="agent"):
     polyak: float = setting(
         0.99, "share of a target network that an update keeps", low=0, high=1, part=LEARNING
     )
-    goals: tuple[str, ...] = setting(
-        ("future",),
-        "achieved goals that take the desired one's place, each as often: of a later moment of the "
-        "episode, of the next one, of the last one",
-        choices=GOALS,
-        part=LEARNING,
-    )
     relabel_share: float = setting(
-        0.8, "share of a batch whose goal is another; 0: no hindsight", low=0, high=1, part=LEARNING
+        0.8,
+        "share of a batch whose goal is what a later moment of the episode achieved; 0: no "
+        "hindsight",
+        low=0,
+        high=1,
+        part=LEARNING,
     )
     uniform_share: float = setting(
         0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
@@ -45,8 +41,6 @@ class EpisodeConfig(Settings, section="agent"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.goals:
-            raise ConfigError(f"{self.section}.goals must name at least one, got []")
         if self.batch_size > self.replay_capacity:
             raise ConfigError(
                 f"{self.section}.batch_size ({self.batch_size}) must not exceed "

@@ -104,7 +104,7 @@ class EpisodeReplay(Ring):
         task says what it would have been worth (Andrychowicz et al. 2017).
         """
         other = rng.random(len(rows)) < config.relabel_share
-        moments = later(steps, ends, config.goals, rng)
+        moments = later(steps, ends, rng)
         desired = self.arrays[self._spec.desired][rows]
         reached = self.arrays[self._spec.achieved][rows[other], moments[other]]
         desired[other] = self.relabelled(desired[other], reached, rng)
@@ -148,11 +148,7 @@ class EpisodeReplay(Ring):
         self._took(self._slots())
 
 
-def later(steps: Ints, ends: Ints, goals: tuple[str, ...], rng: np.random.Generator) -> Ints:
-    """(B,) a moment after each of these steps: of one of the kinds of `EpisodeConfig.goals`."""
-    count = len(steps)
-    kinds = rng.integers(len(goals), size=count)
-    future = steps + 1 + np.floor(rng.random(count) * (ends - steps)).astype(np.int64)
-    moments = {"future": future, "next": steps + 1, "final": ends}
-    chosen: Ints = np.stack([moments[kind] for kind in goals])[kinds, np.arange(count)]
-    return chosen
+def later(steps: Ints, ends: Ints, rng: np.random.Generator) -> Ints:
+    """(B,) a moment after each of these steps, any up to the end."""
+    ahead: Ints = np.floor(rng.random(len(steps)) * (ends - steps)).astype(np.int64)
+    return steps + 1 + ahead

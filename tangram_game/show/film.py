@@ -105,7 +105,7 @@ class _Move:
 
     def __init__(self, task: Place, played: Played, step: int) -> None:
         layout, sim = task.layout, task.sim
-        self._step, self._lifts = step, sim.motion == "lift"
+        self._step = step
         ends = played.corners[:, step : step + 2]
         poses, sides = layout.poses(ends), layout.flipped(ends)
         rolls: Floats = np.pi * sides.astype(np.float64)
@@ -130,16 +130,15 @@ class _Move:
     def at(self, share: float) -> Frame:
         """The frame after a share of the action's time in (0, 1]."""
         way = share * share * (3.0 - 2.0 * share)  # gently off and on
-        # What is carried leaves the others alone until it is set down; what slides pushes them.
-        others = 0.0 if self._lifts and share < 1.0 else way
-        gone: Floats = np.full(self._poses.shape[:2], others)
+        # What is carried leaves the others alone until it is set down.
+        gone: Floats = np.full(self._poses.shape[:2], float(share == 1.0))
         there_and_back = 1.0 - abs(2.0 * way - 1.0)
         gone[self._rows, self._token] = np.where(self._stopped, there_and_back, way)
         return Frame(
             poses=self._poses + gone[..., None] * self._way,
             rolls=self._rolls + gone * self._roll,
             held=self._held,
-            height=float(np.sin(np.pi * share) ** 0.5) if self._lifts and share < 1.0 else 0.0,
+            height=float(np.sin(np.pi * share) ** 0.5) if share < 1.0 else 0.0,
             stopped=self._stopped,
             done=self._step + (share == 1.0),
         )

@@ -17,7 +17,7 @@ Options may be written as elsewhere in this project: runs=9 for --runs 9.
 examples:
   tangram-bench learner                     a table of the learner alone
   tangram-bench learner runs=9 out=l.json   more runs, and a file with machine, versions, commit
-  tangram-bench all out=bench.json          learner, sim and scaling (make bench)
+  tangram-bench all out=bench.json          learner and scaling (make bench)
   tangram-bench fetch id=PandaPush-v3 minutes=60    ours and Stable-Baselines3 side by side
   tangram-bench fetch seeds=3 rows=fetch.csv    five tasks; given again, it goes on
   tangram-bench chaos minutes=20 seed=1     random faults over a real training
@@ -27,7 +27,6 @@ RATES = {
     "learner": "updates against single operations and Stable-Baselines3",
     "fetch": "tasks of Fetch and Panda learned, against Stable-Baselines3",
     "scaling": "more workers, and 64 synthetic ones",
-    "sim": "pushes of a finger, against a bare loop over the engine's steps",
     "gpu": "updates on a GPU, recorded, against other ways there and one core",
 }
 TRIALS = {
@@ -52,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     kinds = parser.add_subparsers(dest="kind", required=True)
-    for name, text in {"all": "learner, sim and scaling", **RATES}.items():
+    for name, text in {"all": "learner and scaling", **RATES}.items():
         one = kinds.add_parser(name, help=text, description=text)
         one.add_argument("--runs", type=int, default=5, help="measurements of each rate (5)")
         one.add_argument("--out", type=Path, help="JSON file of the results")

@@ -9,14 +9,12 @@ from tangram_core.run.process import keep_memory
 from tangram_lab.benchmarks.measure import Row, page, show, write
 from tangram_lab.benchmarks.speed.fetch import TASKS, Match, measure_fetch
 from tangram_lab.benchmarks.speed.learner import measure_gpu, measure_learner
-from tangram_lab.benchmarks.speed.pushes import measure_pushes
 from tangram_lab.benchmarks.speed.scaling import measure_scaling
 
 STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
     "learner": lambda given: measure_learner(given.runs),
     "scaling": lambda given: measure_scaling(given.runs),
     "fetch": lambda given: measure_fetch(_matches(given), given.rows),
-    "sim": lambda given: measure_pushes(given.runs),
     "gpu": lambda given: measure_gpu(given.runs),
 }
 
@@ -28,7 +26,7 @@ def run_stages(given: argparse.Namespace) -> int:
     """
     torch.set_num_threads(1)  # both as masters and workers do
     keep_memory()
-    names = ["learner", "sim", "scaling"] if given.kind == "all" else [given.kind]
+    names = ["learner", "scaling"] if given.kind == "all" else [given.kind]
     rows = [row for name in names for row in STAGES[name](given)]
     title, cells = f"{given.kind}: medians, one thread each", [cells_of(row) for row in rows]
     show(title, cells)

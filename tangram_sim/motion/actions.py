@@ -33,14 +33,12 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
 
     A start lies inside the arena, or its middle does, and each action moves a token in x and in y
     by at most the arena's width; turning keeps a corner within the start's margin for every angle.
-    A token that slides may push another as far, in each action of the episode; one that settles
-    moves others by less, wherever it was set down.
+    One that settles moves others by less, wherever it was set down.
     Pictures show a token with its middle in them, wherever the camera stands, and while they show
     nothing of it, it is taken to lie where it was told to go.
     """
-    pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
     inside = 1.0 if sim.looks or sim.overhang else 0.5
-    moved = sim.actions_per_token + pushes
+    moved = sim.actions_per_token + (tokens > 1)
     return sim.arena * (inside + moved) * _ROUNDING
 
 

@@ -8,9 +8,8 @@ about as it was told.
 Legend: B environments, K tokens, V corners, P pixels along a side of a picture.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -37,10 +36,7 @@ class Look:
     sure: Bools
 
 
-class Eye(Protocol):
-    """Finds tokens in a picture (P, P), told where those lay before that should not have moved."""
-
-    def __call__(self, picture: Pixels, before: Look | None = None, /) -> Look: ...  # noqa: D102
+Eye = Callable[[Pixels], Look]  # finds tokens in a picture (P, P)
 
 
 class Sight:
@@ -105,10 +101,7 @@ class Sight:
         # What was given away before stays as it is.
         self.missing = self.missing.copy()
         for b, (state, token) in enumerate(zip(states, moved.tolist(), strict=True)):
-            stayed = ~self.missing[b]
-            stayed[token] &= not ways[b].any()
-            before = Look(self._poses[b], self._flipped[b], stayed, stayed)
-            self._take(b, self._eye(state, before), token, ways[b])
+            self._take(b, self._eye(state), token, ways[b])
         self.corners = self._layout.corners(self._poses, self._flipped)
         beyond = np.abs(self.corners).max(axis=2) > self._half
         out = np.logical_or.reduceat(beyond, self._layout.starts[:-1], axis=1)

@@ -78,9 +78,6 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     if sim.mirrored and not layout.any_chiral:
         alike, chiral = "tokens that are their own mirror images", "take a set with a parallelogram"
         refuse_ignored(f"sim.mirrored={told(sim.mirrored)}", alike, chiral, 0.0)
-    if sim.motion != SimConfig.motion and layout.tokens == 1:
-        given, usual = f"sim.motion={sim.motion}", SimConfig.motion
-        refuse_ignored(given, "one token", "take a set of several", usual)
     _check_thick(layout, sim)
     if sim.looks:
         _check_names(layout, sim.observe)
@@ -111,7 +108,7 @@ def _check_names(layout: Layout, observe: str) -> None:
 
 
 def _check_thick(layout: Layout, sim: SimConfig) -> None:
-    """Refuse what is lost in its arena: a slide across takes thousands of steps of the engine."""
+    """Refuse what is lost in its arena."""
     shape = min(layout.shapes, key=lambda one: thickness(one.corners))
     thin = thickness(shape.corners)
     if thin < MIN_THICKNESS * sim.arena:

@@ -29,12 +29,9 @@ _LIFTED = 3.0 * _WALL
 # smaller by it on every side, so that pieces that only touch leave each other alone.
 _MARGIN = 1e-4
 _UPRIGHT = 1e4  # inertia about x and y, far more than a token's: none tips over
-# Of the edges of tokens that slide along each other, which the engine multiplies: 0.04 for two, so
-# that they glide and do not drag each other along.
+# Of the edges of tokens that are pushed apart, which the engine multiplies: 0.04 for two, so that
+# they glide and do not drag each other along.
 _FRICTION = 0.2
-_GRIP = 1e3  # mass of the token that is pushed along the table, as a multiple of its own
-_STRIDE = 0.02  # longest way of any of its points in one step
-_THIN = 0.5  # the same as a share of the thinnest token's thickness, which is not to be jumped over
 _RECOVERY = 0.5  # share of an overlap that one step removes while tokens settle
 _SETTLED = 1e-5  # deepest overlap that stays
 _SETTLE_STEPS, _SETTLE_S = 200, 1.0 / 240.0
@@ -62,16 +59,11 @@ class PhysicsWorld:
                 "close environments, or use fewer of them"
             )
         self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
-        self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
-        self._radius = (layout.radii * self._unit).tolist()
-        thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
-        self._stride = min(_STRIDE, _THIN * thin)
+        self._alone = layout.tokens == 1
         self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
         self._bodies = [self._make_body(shape) for shape in layout.shapes]
-        told = [pybullet.getDynamicsInfo(b, -1, physicsClientId=self._client) for b in self._bodies]
-        self._masses = [(one[0], one[2][2]) for one in told]  # and inertia about the vertical
-        for token in range(layout.tokens):
-            self._weigh(token, 1.0)
+        for body in self._bodies:
+            self._keep_upright(body)
         self._play_at_once()
         if sim.pixels:
             self._pixels = sim.pixels
@@ -89,11 +81,7 @@ class PhysicsWorld:
     def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
         """See `World.move`."""
         # Every body rests between calls: `place` relies on the stop at the end.
-        command = self._command(velocity)
-        if self._slides and not self._alone:
-            self._slide(token, command)
-        else:
-            self._lift(token, command, flip)
+        self._lift(token, self._command(velocity), flip)
 
     def poses(self) -> Floats:
         """See `World.poses`."""
@@ -139,28 +127,8 @@ class PhysicsWorld:
         pybullet.stepSimulation(physicsClientId=self._client)
         self._stop_all()
 
-    def _slide(self, token: int, command: _Command) -> None:
-        """Push a token along the table; what is in its way does not slow it down.
-
-        The table's friction stops the others as soon as nothing pushes them.
-        """
-        start, way = np.array(self._pose(token)), np.array(command)
-        longest = math.hypot(*command[:2]) + abs(command[2]) * self._radius[token]
-        steps = max(_SUBSTEPS, math.ceil(longest / self._stride))
-        self._weigh(token, _GRIP)
-        self._play_steps_of(1.0 / steps)
-        for step in range(1, steps + 1):
-            self._set_velocity(token, *command)
-            pybullet.stepSimulation(physicsClientId=self._client)
-            self._stop_all()
-            # However heavy, it lost a little to what it pushes.
-            self._put(token, *(start + way * (step / steps)).tolist())
-        self._settle(pinned=token)
-        self._weigh(token, 1.0)
-
-    def _settle(self, pinned: int | None = None) -> None:
-        """Push overlapping tokens apart, without momentum; a pinned token stays where it is."""
-        pose = (0.0, 0.0, 0.0) if pinned is None else self._pose(pinned)
+    def _settle(self) -> None:
+        """Push overlapping tokens apart, without momentum."""
         pybullet.performCollisionDetection(physicsClientId=self._client)
         self._play_steps_of(_SETTLE_S)
         for _ in range(_SETTLE_STEPS):
@@ -168,8 +136,6 @@ class PhysicsWorld:
                 break
             pybullet.stepSimulation(physicsClientId=self._client)
             self._stop_all()
-            if pinned is not None:
-                self._put(pinned, *pose)
         self._play_at_once()
 
     def _forget_contacts(self) -> None:
@@ -242,14 +208,14 @@ class PhysicsWorld:
             pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
         return body
 
-    def _weigh(self, token: int, times: float) -> None:
-        """Set the mass and inertia of a token to `times` its own."""
-        mass, inertia = self._masses[token]
+    def _keep_upright(self, body: int) -> None:
+        """Keep the inertia about the vertical alone, so that a body never tips over."""
+        mass, _, inertia, *_ = pybullet.getDynamicsInfo(body, -1, physicsClientId=self._client)
         pybullet.changeDynamics(
-            self._bodies[token],
+            body,
             -1,
-            mass=mass * times,
-            localInertiaDiagonal=(_UPRIGHT * times, _UPRIGHT * times, inertia * times),
+            mass=mass,
+            localInertiaDiagonal=(_UPRIGHT, _UPRIGHT, inertia[2]),
             physicsClientId=self._client,
         )
 

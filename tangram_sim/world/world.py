@@ -16,10 +16,9 @@ from tangram_sim.targets.targets import check_targets, sample_starts, sample_tar
 class World(Protocol):
     """K tokens on the plane, in a square arena around the origin.
 
-    Both backends keep this contract; one test module holds them to it. A lifted token is carried
+    Both backends keep this contract; one test module holds them to it. A token is carried
     above the others and set down; with the engine, tokens that are set down in one place then push
-    each other apart. A sliding one pushes what is in its way. Nothing stops one at the arena's
-    edge.
+    each other apart. Nothing stops one at the arena's edge.
     """
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
@@ -32,7 +31,7 @@ class World(Protocol):
         """
 
     def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
-        """Move one token for one second, as `sim.motion` says, and stop it.
+        """Move one token for one second, and stop it.
 
         Args:
             token: its index.

@@ -27,7 +27,7 @@ class Camera:
         self._rows = present[self._layout.token_of_corner]
         self._part = own = part(self._layout, tuple(self._tokens.tolist()))
 
-        def look(picture: Pixels, _before: Look | None = None) -> Look:
+        def look(picture: Pixels) -> Look:
             return see(coverage(picture), own, ARENA)
 
         self._sight = Sight(own, look, 1, ARENA)

@@ -6,19 +6,15 @@ from tangram_core.task import Chooser, Env
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_tasks.rivals.baselines import exact_policy, position_policy, random_policy
-from tangram_tasks.rivals.sweeps import MAX_TOKENS, sweep_policy
 
 
 def rivals_of(layout: Layout, sim: SimConfig) -> Mapping[str, Callable[[Env], Chooser]]:
     """Those that a world has, the strongest first.
 
     `exact` moves every token exactly onto its target, `position only` one token onto its centre and
-    never turns it, `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order
-    that pushes the least out of place.
+    never turns it, `random` is chance.
     """
     found: dict[str, Callable[[Env], Chooser]] = {"exact": lambda _: exact_policy(layout, sim)}
-    if sim.motion == "slide" and layout.tokens <= MAX_TOKENS:
-        found["sweep rule"] = lambda _: sweep_policy(layout, sim)
     if layout.tokens == 1:
         found["position only"] = lambda _: position_policy(layout, sim)
     return found | {"random": lambda _: random_policy(layout, sim)}

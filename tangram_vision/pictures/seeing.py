@@ -2,8 +2,7 @@
 
 Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
 All tokens are known, so what explains one blob leaves less for the others: all are explained
-together. Tokens that look alike come in any order. Who looked before need not find again what has
-not moved.
+together. Tokens that look alike come in any order.
 
 Legend of this package: P pixels along a side of a picture, K tokens, N blobs. Coverage is (P, P)
 float32, about 0 where a picture shows the ground and about 1 where it shows a token.
@@ -25,8 +24,6 @@ from tangram_vision.pictures.blobs import Blobs, find_blobs, likeness
 from tangram_vision.pictures.edges import refined
 from tangram_vision.pictures.kinds import Kind, kinds_of
 from tangram_vision.pictures.piles import Laid, arrangements, reaching_out
-from tangram_vision.pictures.ramps import fitted, ramps
-from tangram_vision.pictures.recalling import recalled
 
 _SMALLEST = 0.4  # of the smallest token: less is dirt
 _CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
@@ -50,7 +47,7 @@ class _Explained:
     doubtful: bool = False
 
 
-def see(cover: Singles, layout: Layout, arena: float, before: Look | None = None) -> Look:
+def see(cover: Singles, layout: Layout, arena: float) -> Look:
     """What a picture of an arena shows of a layout's tokens.
 
     Args:
@@ -58,16 +55,15 @@ def see(cover: Singles, layout: Layout, arena: float, before: Look | None = None
             their size.
         layout: the tokens.
         arena: width of the picture.
-        before: where those lay that are not told to have moved; None: nothing is known.
     """
     pixels = len(cover)
     kinds = kinds_of(layout, arena, pixels)
     poses, flipped = np.zeros((layout.tokens, 3)), np.zeros(layout.tokens, np.bool_)
     known, sure = np.zeros_like(flipped), np.zeros_like(flipped)
-    puzzle = _puzzle(cover, kinds, Counter({kind.shape: len(kind.tokens) for kind in kinds}))
     left = {kind.shape: list(kind.tokens) for kind in kinds}
-    stayed = None if before is None else _stayed(puzzle, cover, before, arena)
-    for one in stayed or puzzle.explained():
+    counts = Counter({shape: len(tokens) for shape, tokens in left.items()})
+    blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
+    for one in _Puzzle(blobs, kinds, counts).explained():
         for number, pose in zip(one.laid.kinds, one.laid.poses, strict=True):
             token = left[kinds[number].shape].pop(0)
             poses[token], flipped[token] = pose, kinds[number].flipped
@@ -76,49 +72,6 @@ def see(cover: Singles, layout: Layout, arena: float, before: Look | None = None
     poses[known, :2] = (poses[known, :2] + (-pixels / 2.0, pixels / 2.0)) * unit
     poses[:, 2] = np.angle(np.exp(1j * poses[:, 2]))
     return Look(poses, flipped, known, sure)
-
-
-def _puzzle(cover: Singles, kinds: Sequence[Kind], left: Counter[int]) -> "_Puzzle":
-    """What coverage (P, P) by so many tokens of each shape shows."""
-    blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
-    return _Puzzle(blobs, kinds, left)
-
-
-def _stayed(
-    puzzle: "_Puzzle", cover: Singles, before: Look, arena: float
-) -> list[_Explained] | None:
-    """What all blobs are, where piles have tokens that lie where they lay before.
-
-    Returns:
-        None where no pile has any, or where they and what else is found do not explain all piles.
-    """
-    kinds, side = puzzle.kinds, len(cover)
-    piles = puzzle.piles()
-    if piles is None:
-        return None
-    names, poses = recalled(kinds, before, arena, piles)
-    if not names:
-        return None
-    gone = ramps([kinds[name] for name in names], poses, side).sum(axis=0)
-    rest = np.clip(cover - gone, 0.0, None).astype(np.float32)
-    left = puzzle.left - Counter(kinds[name].shape for name in names)
-    alone = list[_Explained]()
-    for one in _puzzle(rest, kinds, left).explained():
-        if _levels_at(piles, one.laid.poses).max() < 0.5:
-            alone.append(one)
-        else:
-            names, poses = [*names, *one.laid.kinds], np.vstack([poses, one.laid.poses])
-    poses, differs = fitted([kinds[name] for name in names], poses, piles)
-    if differs >= _DIFFERS:
-        return None
-    return [*alone, _Explained(Laid(tuple(names), poses, differs))]
-
-
-def _levels_at(cover: Singles, poses: Floats) -> Floats:
-    """(n,) coverage (P, P) in the middle of tokens."""
-    column, row = poses[:, 0].astype(np.int64), (-poses[:, 1]).astype(np.int64)
-    most = len(cover) - 1
-    return cover[np.clip(row, 0, most), np.clip(column, 0, most)].astype(np.float64)
 
 
 @dataclass
@@ -234,13 +187,6 @@ class _Puzzle:
         ]
         self._known[key] = options
         return options
-
-    def piles(self) -> Singles | None:
-        """(P, P) coverage by what is whole and no single token; None if there is none."""
-        blobs = self.blobs
-        many = [b for b in range(len(blobs)) if b not in self._singles and not blobs.cut[b]]
-        side = blobs.cover.shape[1]
-        return blobs.cover.reshape(-1, side, side)[many].sum(axis=0) if many else None
 
     @cached_property
     def _singles(self) -> dict[int, _Explained]:

@@ -40,7 +40,6 @@ pytestmark = pytest.mark.fast
 
 COUNT = 120
 PARALLELOGRAM = 6
-SLIDE = {"backend": "physics", "motion": "slide"}
 Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -64,9 +63,7 @@ def explored(made: Setup, count: int = COUNT) -> tuple[np.ndarray, np.ndarray]:
     return policy.act(*scene), policy.explore(*scene, generators(count))
 
 
-@pytest.mark.parametrize(
-    "made", [setup(agent=SCENE), seven({}, SMALL), seven({}, PERCEPTRON, **SLIDE)]
-)
+@pytest.mark.parametrize("made", [setup(agent=SCENE), seven({}, SMALL), seven({}, PERCEPTRON)])
 def test_weights_travel_to_workers(made: Setup) -> None:
     weights, actor = Weights(7, learner_of(made).broadcast()), made.agent.actor(made.task)
     policy = Acting(actor)
@@ -366,7 +363,7 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
         ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
         ("agent", "kind", "scene", "agent.kind=scene does not fit .*kind=pair: leave"),
         ("sim", "arena", 3.0, "trained with sim.arena=2: leave it out, or train a run with it"),
-        ("sim", "motion", "slide", "run with sim.motion=slide: .* needs the engine's contacts"),
+        ("sim", "pixels", 8, "run with sim.pixels=8: sim.pixels must be 0 or at least 16"),
     ],
 )
 def test_settings_that_a_trained_run_cannot_play_with_are_refused(

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tangram_core.errors import ConfigError
@@ -16,7 +15,6 @@ from tangram_lab.benchmarks.measure import Bound, compared, rates, single
 from tangram_lab.benchmarks.speed import fetch
 from tangram_lab.benchmarks.speed.fetch import Curve, Match, measure_fetch
 from tangram_lab.benchmarks.speed.learner import measure_gpu
-from tangram_lab.benchmarks.speed.pushes import PUSHES, ways
 from tangram_lab.benchmarks.stages import STAGES, run_stages
 
 LABELS = ("stage", "case", "unit")
@@ -113,14 +111,6 @@ def test_all_is_all_that_needs_no_gpu_and_no_robots(monkeypatch: pytest.MonkeyPa
         monkeypatch.setitem(STAGES, name, lambda _, one=row: measured.append(one.stage) or [one])
     assert run_stages(argparse.Namespace(kind="all", out=None)) == 0
     assert {*STAGES} - {*measured} == {"gpu", "fetch"}
-
-
-@pytest.mark.fast
-def test_a_bare_loop_pushes_as_we_do() -> None:
-    table, *both = ways(2)
-    ends = [(way(), table.poses()) for way in both]
-    assert [count for count, _ in ends] == [PUSHES, PUSHES]
-    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=5e-3)
 
 
 @pytest.mark.fast

@@ -50,7 +50,6 @@ OF_TOKENS = {
 AGENTS: dict[str, Agent] = {
     name: Goal(GoalConfig(algorithm=name, **SMALL)) for name in ("ddpg", "td3", "sac")
 } | {
-    "every goal": Goal(GoalConfig(goals=("future", "next", "final"), **SMALL)),
     "example": TD3.TD3(TD3.TD3Config(**SMALL)),
 }
 

@@ -43,7 +43,7 @@ PLAYED = [
     {"shapes": TRIO, "scale": 0.8, "pixels": 64, "actions_per_token": 2, "reward": "dense"},
     GAME | {"allow_flip": True, "starts": "outside"},
     GAME | {"targets": "figures", "mirrored": 0.5},
-    GAME | {"motion": "slide", "targets": "connected"},
+    GAME | {"targets": "connected"},
 ]
 
 
@@ -58,8 +58,6 @@ PLAYED = [
 def test_gymnasium_checks_it_without_a_warning(
     name: str, settings: dict[str, Any], made: list[Any]
 ) -> None:
-    if settings.get("motion") == "slide":
-        settings = settings | {"backend": "physics"}  # nothing else has contacts
     env = gymnasium.make(name, render_mode="rgb_array", **settings)
     made.append(env)
     with warnings.catch_warnings():

@@ -9,12 +9,10 @@ import pytest
 from tangram_core.arrays import Floats, Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.puzzles.figures import library
 from tangram_sim.sight.perception import Look
 from tangram_sim.sight.pictures import coverage, rasterise
 from tangram_sim.targets.connected import sample_connected
 from tangram_sim.targets.sampling import sample_batch
-from tangram_sim.targets.targets import placement
 from tangram_vision.pictures.blobs import find_blobs
 from tangram_vision.pictures.seeing import see
 from tests.sim.builders import LOPSIDED, SEVEN, layout_of, pieces
@@ -148,62 +146,6 @@ def test_seven_tokens_in_piles_are_seen(poses: list[list[float]]) -> None:
     layout, sides = layout_of(*SEVEN, scale=0.6), np.zeros(7, np.bool_)
     seen = see(shown(layout.corners(np.array(poses)), layout, 128), layout, ARENA)
     assert (errors(layout, np.array(poses), sides, seen) < (0.01, 2.0)).all()
-
-
-SEVEN_TANS = layout_of(*SEVEN, scale=0.6)
-
-
-def lying(name: str) -> tuple[Floats, Any]:
-    """A figure of the library, which is a pile of seven."""
-    (puzzle,) = [one for one in library("test", 0.6) if one.name == name]
-    return placement(puzzle, SEVEN_TANS)
-
-
-def before(poses: Floats, flipped: Any, *moved: int) -> Look:
-    """Of tokens that moved nothing is known: they are said to lie in the middle of the others."""
-    stayed = ~np.isin(np.arange(7), moved)
-    told = np.where(stayed[:, None], poses, poses[stayed].mean(axis=0))
-    return Look(told, flipped, stayed, stayed)
-
-
-@pytest.mark.parametrize("moved", [0, 2, 4, 5, 6])
-@pytest.mark.parametrize("pixels", [128, 64])
-def test_a_whole_figure_is_told_apart_by_who_knows_what_lay_there(moved: int, pixels: int) -> None:
-    """The token that came last is what the others leave."""
-    poses, flipped = lying("heart")
-    picture = shown(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, pixels)
-    assert not see(picture, SEVEN_TANS, ARENA).sure.any()
-    seen = see(picture, SEVEN_TANS, ARENA, before(poses, flipped, moved))
-    assert seen.sure.all()
-    assert (errors(SEVEN_TANS, poses, flipped, seen) < (0.5 / pixels, 3.0)).all()
-
-
-def test_a_token_that_was_pushed_is_found_where_it_lies_now() -> None:
-    """The square lay elsewhere, as far as is known; a triangle was pushed by two pixels."""
-    poses, flipped = lying("heart")
-    known = before(poses, flipped, 5)
-    poses[4] += (0.06, -0.05, 0.02)
-    poses[5] = (-0.8, 0.8, 0.3)
-    seen = see(shown(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, 128), SEVEN_TANS, ARENA, known)
-    assert seen.sure.all()
-    assert (errors(SEVEN_TANS, poses, flipped, seen) < (0.005, 2.0)).all()
-
-
-def test_what_was_known_and_is_wrong_is_forgotten() -> None:
-    """Of another figure in the same place: as if nothing had been known."""
-    poses, flipped = lying("swan")
-    picture = shown(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, 128)
-    seen = see(picture, SEVEN_TANS, ARENA, before(*lying("heart")))
-    alone = see(picture, SEVEN_TANS, ARENA)
-    np.testing.assert_array_equal((seen.known, seen.sure), (alone.known, alone.sure))
-
-
-def test_what_lies_alone_is_seen_alike_whatever_was_known() -> None:
-    layout, rng = SEVEN_TANS, np.random.default_rng(8)
-    poses, flipped = scene(layout, rng, 0.05)
-    picture = shown(layout.corners(poses, flipped), layout, 128)
-    alone, told = see(picture, layout, ARENA), see(picture, layout, ARENA, before(*lying("heart")))
-    np.testing.assert_array_equal(told.poses, alone.poses)
 
 
 @pytest.mark.parametrize("what", ["nothing", "half of it", "another shape"])

@@ -42,9 +42,8 @@ OTHER = MINE | {"tokens": {"shapes": ["parallelogram"], "scale": 1.0}}
     [
         (MADE, 5),
         (seven(PAIRS, PERCEPTRON, mirrored=0.5), 1),
-        (seven(PAIRS, PERCEPTRON, backend="physics", motion="slide"), 1),
     ],
-    ids=["one token", "lifted", "sliding"],
+    ids=["one token", "several"],
 )
 def test_a_run_goes_on_as_if_it_had_never_stopped(
     tmp_path: Path, made: Setup, rounds: int, caplog: pytest.LogCaptureFixture

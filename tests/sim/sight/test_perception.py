@@ -1,7 +1,6 @@
 """Tokens that look alike keep their names, what is missing stays, and a hand finds what is seen."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,31 +89,6 @@ def test_a_hand_takes_the_token_that_lies_where_one_is_seen() -> None:
     true = LAYOUT.corners(np.array([[START[0], START[2], START[1]]]))
     hands = [int(seen.hands(np.array([token]), true)[0]) for token in range(3)]
     assert hands == [0, 2, 1]
-
-
-@pytest.mark.parametrize(
-    ("moved", "way", "stayed"),
-    [(0, 0.1, [False, False, True]), (2, 0.1, [True, False, False]), (2, 0.0, [True, False, True])],
-)
-def test_an_eye_is_told_what_lies_where_it_lay(moved: int, way: float, stayed: list[bool]) -> None:
-    """Not what was told to move, and not what is missing."""
-    given: list[Look | None] = []
-    shown = iter([look(START, doubtful=1), look(GOAL), look(GOAL)])
-
-    def eye(_: Pixels, before: Look | None = None) -> Look:
-        given.append(before and replace(before, poses=before.poses.copy()))
-        return next(shown)
-
-    seen = Sight(LAYOUT, eye, 1, 2.0)
-    seen.begin(PICTURES, PICTURES)
-    seen.follow(PICTURES, np.array([moved]), np.array([[way, 0.0, 0.0]]))
-    first, target, last = given
-    assert target is None
-    assert first is not None
-    assert last is not None
-    assert not first.known.any()
-    assert last.known.tolist() == last.sure.tolist() == stayed
-    np.testing.assert_allclose(last.poses[last.known], np.array(START)[stayed])
 
 
 @pytest.mark.parametrize("told", [0.1, 1.4, -3.0, 2.9])

@@ -172,8 +172,6 @@ def test_a_run_begins_with_anothers_networks_and_new_optimisers() -> None:
     ("changes", "told"),
     [
         ({"hidden": ()}, "agent.hidden must name at least one"),
-        ({"goals": ()}, "agent.goals must name at least one"),
-        ({"goals": ("past",)}, "agent.goals must be one of future, next, final"),
         ({"batch_size": 101}, "must not exceed agent.replay_capacity"),
         ({"algorithm": "ddpg", "actor_delay": 3}, "agent.actor_delay=3 changes nothing with"),
         ({"gamma": 1.0}, "agent.gamma must be between 0 and"),

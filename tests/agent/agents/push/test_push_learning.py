@@ -13,9 +13,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_it_learns_to_push_a_square() -> None:
-    agent = Pushing(
-        PushingConfig(width=32, batch_size=64, polyak=0.98, goals=("future", "next"), looked_at=16)
-    )
+    agent = Pushing(PushingConfig(width=32, batch_size=64, polyak=0.98, looked_at=16))
     learner, actor = agent.learner(SQUARE, 0, "cpu"), agent.actor(SQUARE)
     rng = {name: np.random.default_rng([0, i]) for i, name in enumerate(learner.streams)}
     actor.load(learner.broadcast())
