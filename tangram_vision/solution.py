@@ -22,14 +22,14 @@ class Token(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One token where it lies.
 
     Attributes:
-        order: when it is laid, from 1: the larger ones first. None lies on another.
+        order: when it is laid, from 1: the larger ones first.
         shape: its name, as in `tokens.shapes`.
         x, y: its centre of area, in sides of the full square that tans are cut from, y up, from the
             middle of the figure.
         angle: radians by which the shape is turned, against the clock, after it was turned over.
         flipped: whether it is turned over, about its x axis.
         corners: as x and y.
-        pixels: the same corners in the picture, y down, (0, 0) its upper left corner.
+        pixels: the same corners in `Solution.picture`, y down, (0, 0) its upper left corner.
     """
 
     order: int
@@ -43,7 +43,7 @@ class Token(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Picture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The picture that `pixels` count in: as it was given, or one that an outline was drawn in."""
+    """What `pixels` count in: the picture as given; of an SVG, or outlines, one of our own."""
 
     width: int
     height: int

@@ -53,6 +53,8 @@ class Planner(nn.Module):
     token: Tensor
     flip: Tensor
     piece: Tensor
+    every: Tensor
+    tokens: Tensor
 
     def __init__(self, networks: Networks, task: Place, reapply: int) -> None:
         super().__init__()
@@ -62,8 +64,11 @@ class Planner(nn.Module):
         turns_over = task.layout.chiral & task.sim.allow_flip
         sides = np.stack([np.ones_like(turns_over), turns_over], axis=-1)
         every = np.broadcast_to(sides[..., None], (*sides.shape, self._tokens))
-        for name, index in zip(("token", "flip", "piece"), np.nonzero(every), strict=True):
-            self.register_buffer(name, torch.from_numpy(index), persistent=False)
+        token, flip, piece = map(torch.from_numpy, np.nonzero(every))
+        constants = {"token": token, "flip": flip, "piece": piece}
+        constants |= {"every": torch.arange(len(token)), "tokens": torch.arange(self._tokens)}
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
 
     def forward(self, corners: Tensor, placed: Tensor, goals: Tensor) -> tuple[Tensor, ...]:
         """What to play; where all tokens are placed, some action of the first one.
@@ -112,9 +117,8 @@ class Planner(nn.Module):
         them needs; where it is written down shapes hang on B alone.
         """
         is_open = placed == 0
-        first = torch.arange(self._tokens) == 0
-        allowed = (is_open | (first & ~is_open.any(1, keepdim=True)))[:, self.token]
-        which = torch.arange(self.token.shape[0]).expand(allowed.shape)
+        allowed = (is_open | ((self.tokens == 0) & ~is_open.any(1, keepdim=True)))[:, self.token]
+        which = self.every.expand(allowed.shape)
         if not torch.compiler.is_exporting():
             which = (~allowed).int().argsort(dim=1, stable=True)[:, : int(allowed.sum(1).max())]
             allowed = allowed.gather(1, which)
@@ -148,7 +152,7 @@ class Planner(nn.Module):
         """(B, N') what candidates in poses are worth for all pieces, less what they give up."""
         count = self._tokens
         every = which.repeat_interleave(count, dim=1)
-        piece = torch.arange(count).repeat(which.shape[1]).expand(every.shape)
+        piece = self.tokens.repeat(which.shape[1]).expand(every.shape)
         pairs = self._pairs(scene, rows, every, piece)
         values = self._valued(pairs, pose.repeat_interleave(count, dim=0))
         return values.view(*which.shape, count).sum(2) - scene.worth[rows, self.token[which]]
