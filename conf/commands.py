@@ -280,7 +280,7 @@ onnx; agents that search (outline, push) are more than a network and are refused
             "tangram-export run_dir=runs/my_run agent.reapply=0    # fewer steps, a smaller file",
         ),
         ("tangram_game.config:ExportConfig",),
-        over=("agent",),
+        over=("sim", "reward", "agent"),
     ),
     "studio": Command(
         "tangram-studio",

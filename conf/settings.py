@@ -71,7 +71,7 @@ def _laid_over(command: Command) -> Iterator[str]:
     if command.over:
         names = ", ".join(f"`{name}`" for group in command.over for name in playable(group))
         yield (
-            "In place of what the run was trained with, as in `sim.actions_per_token=3`: "
+            "In place of what the run was trained with, as in `agent.reapply=1`: "
             f"{names}. The others of {', '.join(command.over)} are refused."
         )
 

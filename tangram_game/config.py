@@ -228,7 +228,8 @@ class ExportConfig(Settings):
     def __post_init__(self) -> None:
         check_folder("run_dir", self.run_dir)
         super().__post_init__()
-        _check_out(self.out)
+        if Path(self.out).suffix != ".onnx":
+            raise ConfigError(f"out must end with .onnx, got '{self.out}': set out=agent.onnx")
         lacking = [name for name in ("onnx", "onnxscript", "onnxruntime") if not find_spec(name)]
         if lacking:
             raise ConfigError(

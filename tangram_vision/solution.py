@@ -43,7 +43,7 @@ class Token(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Picture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What `pixels` count in: the picture as given; of an SVG, or outlines, one of our own."""
+    """What `pixels` count in: the picture as given, at most 1,280; of outlines one of our own."""
 
     width: int
     height: int

@@ -97,14 +97,14 @@ class Head(nn.Module):
 
 
 def untraced() -> None:
-    """Refuse to be traced: a trace keeps what hangs on the one scene that it was made of.
+    """Refuse to be traced: a trace repeats for all scenes what was done for one.
 
     Raises:
         ConfigError: torch.jit.trace is at work.
     """
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         raise ConfigError(
-            "torch.jit.trace would fix one scene for all: tangram-export writes an agent down"
+            "torch.jit.trace would do for all scenes what it saw done for one: use tangram-export"
         )
 
 

@@ -22,7 +22,16 @@ LONGEST = 1280  # pixels of the longer side that are looked at
 _PAPER, _SLATE = (255, 255, 255), (0, 0, 0)  # behind what is transparent and dark, and light
 _LIGHT = 200  # mean level of what is light
 # What Pillow raises where a file is not what it says.
-_BROKEN = (OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, struct.error)
+_BROKEN = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    TypeError,
+    LookupError,
+    RuntimeError,
+    struct.error,
+)
 
 
 def read_picture(path: Path, source: str) -> Image.Image:

@@ -59,7 +59,10 @@ def read_svg(path: Path, source: str) -> Image.Image:
     # A page of another colour than white would be a figure itself.
     page = max(shown.shape[:2]) >= SIDE - 1 and shown[..., 3].all()
     if not (page and (shown[0, 0, :3] < 256 - _SEEN).any()) and _reaches_out(root, source):
-        raise ConfigError(f"{source} is cut off: it reaches out of its viewBox, enlarge that")
+        raise ConfigError(
+            f"{source} is cut off: it reaches out of its page: enlarge its viewBox, or width "
+            "and height"
+        )
     return Image.fromarray(np.where(np.pad(figure, _BORDER), 0, 255).astype(np.uint8))
 
 
@@ -105,8 +108,11 @@ def _reaches_out(root: ET.Element, source: str) -> bool:
 
     Not known, so no, where the page is not told in numbers or something is sized by it.
     """
+    told = root.get("viewBox") or "0 0 {} {}".format(
+        *((root.get(name) or "").removesuffix("px") for name in ("width", "height"))
+    )
     try:
-        page = [float(one) for one in re.split(r"[\s,]+", (root.get("viewBox") or "").strip())]
+        page = [float(one) for one in re.split(r"[\s,]+", told.strip())]
         x, y, width, height = page
     except ValueError:
         return False

@@ -134,7 +134,7 @@ CASES: dict[str, tuple[Given, ...]] = {
         svg(SVG.replace("H250V250H50Z", "L250 250")),
         svg(SVG),
     ),
-    "it reaches out of its viewBox, enlarge that": (
+    "it reaches out of its page: enlarge its viewBox, or width and height": (
         svg(SVG.replace("0 0 300 300", "0 0 200 200")),
         svg(SVG),
     ),

@@ -102,8 +102,11 @@ def test_what_reaches_out_of_its_page_is_cut_off(tmp_path: Path, ground: str) ->
     for page in ('width="400" height="300"', 'width="300" preserveAspectRatio="none" height="90"'):
         thin = '<path d="M20 20H80V80H20Z" fill="none" stroke="#000" stroke-width="0.4"/>'
         assert (read(tmp_path, f'<svg {XMLNS} viewBox="0 0 100 100" {page}>{thin}</svg>') < 1).any()
-    with pytest.raises(ConfigError, match="is cut off: it reaches out of its viewBox, enlarge"):
+    with pytest.raises(ConfigError, match="is cut off: it reaches out of its page: enlarge"):
         drawn(400)
+    told = f'<svg {XMLNS} width="300px" height="90"><path d="M20 20H400V80Z"/></svg>'
+    with pytest.raises(ConfigError, match="is cut off"):
+        read(tmp_path, told)
 
 
 @pytest.mark.parametrize(

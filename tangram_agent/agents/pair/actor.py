@@ -52,6 +52,8 @@ class PairActor(NetworkActor):
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
         """Actions (B, A), noisy or anything at all where it explores."""
+        if not len(seen["corners"]):
+            return np.zeros((0, self._task.spec.action_size), np.float32)
         corners, goals = (np.array(seen[name], np.float64) for name in ("corners", "goals"))
         flags = np.array(closed(seen), np.bool_)
         shown = {"corners": corners, "placed": flags, "goals": goals}

@@ -67,13 +67,6 @@ def covered_share(covered: Floats, layout: Layout) -> Floats:
     return share
 
 
-def worths(covered: Floats, layout: Layout) -> Floats:
-    """(B, K) sum over all pieces of each token's values, by what `covering` gave."""
-    own = layout.areas
-    worth: Floats = (covered / np.maximum(own[:, None], own)).sum(axis=2)
-    return worth
-
-
 def newly_covered(token: Lying, piece: Lying, covered: Floats, layout: Layout) -> Floats:
     """(M,) the area of a piece that a token covers and nothing covered before, as a value.
 

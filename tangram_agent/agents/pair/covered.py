@@ -86,8 +86,8 @@ class Covered(nn.Module):
 def shared_areas(first: Tensor, second: Tensor) -> Tensor:
     """(B, K, L) areas that convex polygons (B, K, C, 2) and others (B, L, C, 2) share.
 
-    Sutherland and Hodgman's clipping of sides, whose number grows by one with each line: what is
-    outside becomes a side without length, and one more side joins where the line was crossed.
+    Sutherland and Hodgman's clipping of sides, whose number grows by two with each line: what is
+    outside becomes a side without length, and two join where the line was crossed.
     """
     begins, ends = first[:, :, None], first.roll(-1, 2)[:, :, None]
     for c in range(second.shape[2]):

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from shapely.geometry import Polygon
 
 from tangram_agent.agents.pair.coverage import (
@@ -12,8 +13,8 @@ from tangram_agent.agents.pair.coverage import (
     covering,
     lying,
     newly_covered,
-    worths,
 )
+from tangram_agent.agents.pair.covered import Covered
 from tangram_sim.geometry.layout import TokensConfig, make_layout
 from tests.agent.agents.pair.pair_scenes import SEVEN, random_scene
 from tests.sim.builders import polygons
@@ -52,7 +53,7 @@ def test_what_lies_is_found_in_corners(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_covering_shares_and_worths_against_shapely(seed: int) -> None:
+def test_covering_and_shares_against_shapely(seed: int) -> None:
     rng = np.random.default_rng(seed)
     (poses, sides), (goals, goal_sides) = (random_scene(LAYOUT, rng, 2) for _ in range(2))
     corners, wanted = LAYOUT.corners(poses, sides), LAYOUT.corners(goals, goal_sides)
@@ -64,12 +65,28 @@ def test_covering_shares_and_worths_against_shapely(seed: int) -> None:
     found = covering(corners, wanted, LAYOUT)
     assert expected.max() > 0.01
     np.testing.assert_allclose(found, expected, atol=1e-9)
-    larger = np.maximum(AREAS[:, None], AREAS)
-    np.testing.assert_allclose(worths(found, LAYOUT), (expected / larger).sum(axis=2), atol=1e-7)
     share = covered_share(found, LAYOUT)
     for b, mover, j in np.ndindex(2, 7, 7):
         others = sum(expected[b, i, j] for i in range(7) if i != mover)
         assert share[b, mover, j] == pytest.approx(min(others / AREAS[j], 1.0), abs=1e-7)
+
+
+def test_in_tensors_it_is_the_same() -> None:
+    """Also where a token lies exactly on its piece, and sides fall on sides."""
+    rng = np.random.default_rng(0)
+    (poses, sides), (goals, goal_sides) = (random_scene(LAYOUT, rng, 40) for _ in range(2))
+    there = rng.random(sides.shape) < 0.3
+    poses[there], sides[there] = goals[there], goal_sides[there]
+    corners, wanted = LAYOUT.corners(poses, sides), LAYOUT.corners(goals, goal_sides)
+    covered = Covered(LAYOUT)
+    own, pieces = (covered(torch.from_numpy(one)) for one in (corners, wanted))
+    np.testing.assert_array_equal(own[2].numpy(), sides)
+    np.testing.assert_allclose(own[0].numpy(), poses[..., :2], atol=1e-12)
+    found = covering(corners, wanted, LAYOUT)
+    share, worth = (one.numpy() for one in covered.shares(own, pieces))
+    np.testing.assert_allclose(share, covered_share(found, LAYOUT), atol=1e-9)
+    larger = np.maximum(AREAS[:, None], AREAS)
+    np.testing.assert_allclose(worth, (found / larger).sum(axis=2), atol=1e-9)
 
 
 def test_a_piece_is_covered_once_and_by_others_than_the_token_that_is_to_move() -> None:

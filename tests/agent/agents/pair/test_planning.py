@@ -10,7 +10,7 @@ import torch
 
 from tangram_agent.agents.pair import planning
 from tangram_agent.agents.pair.actor import Decision
-from tangram_agent.agents.pair.coverage import covered_share, covering, worths
+from tangram_agent.agents.pair.coverage import covered_share, covering
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.agents.pair.planning import Planner
@@ -106,7 +106,9 @@ def total(
             pose = proposed(pair(pose, piece))
     still = torch.zeros(1, 3)
     values = [networks.critic(pair(pose, index), still).item() for index in range(layout.tokens)]
-    return sum(values) - worths(covered, layout)[0, token], pose
+    own = layout.areas
+    worth = (covered[0, token] / np.maximum(own[token], own)).sum()
+    return sum(values) - worth, pose
 
 
 @pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
@@ -185,6 +187,26 @@ def test_perfect_networks_assemble_everything(sim: dict[str, Any]) -> None:
     made = seven(starts="outside", **sim)
     overlap, _ = assembled(made, perfect(made), 12)
     assert overlap.min() > 0.999
+
+
+def test_of_two_moves_worth_as_much_the_one_that_fills_its_piece(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By rounding the last of the short list would be worth most."""
+    made = seven()
+    corners, placed, goals = scenes(made)
+    chooser = perfect(made)
+
+    def rounded(_: object, rows: object, which: torch.Tensor, pose: object) -> torch.Tensor:
+        return 1e-6 * torch.arange(which.shape[1]).expand(which.shape)
+
+    monkeypatch.setattr(chooser, "_gained", rounded)
+    found = chosen(chooser, corners, placed, goals)
+    poses = made.task.layout.poses(corners)[np.arange(COUNT), found.token]
+    ends = poses[:, :2] + found.velocity[:, :2] * made.task.sim.arena
+    alike = made.task.layout.areas[found.token][:, None] == made.task.layout.areas
+    apart = np.linalg.norm(made.task.layout.poses(goals)[..., :2] - ends[:, None], axis=2)
+    assert (np.where(alike, apart, np.inf).min(axis=1) < 1e-5).all()
 
 
 def test_a_token_is_turned_over_just_where_its_piece_lies_on_the_other_side() -> None:
