@@ -160,7 +160,8 @@ def compared(run: Run, content: bytes) -> Compared:
         for row in np.flatnonzero(apart > _NO_TIE):
             if _is_tie(run, {name: one[row] for name, one in shown.items()}, other[row]):
                 found.ties, apart[row] = found.ties + 1, 0.0
-        found.count, found.apart = found.count + len(own), max(found.apart, float(apart.max()))
+        found.count += len(own)
+        found.apart = float(np.maximum(found.apart, apart.max()))  # nan, if there is one
         return own
 
     horizon = run.setup.spec.horizon

@@ -68,9 +68,15 @@ def test_an_agent_plays_alike(
     alone = session.run(["action"], {n: np.zeros((1, *s[1:]), "f4") for n, s in wanted.items()})
     assert alone[0].shape == (1, spec.action_size)
 
-    # What plays otherwise is not written.
+    # What plays otherwise is not written, be it by little.
     content = out.read_bytes()
     out.unlink()
+    play = own.actor.act
+    for by, why in ((5e-5, "is 5.0e-05 off"), (np.nan, "is nan off")):
+        monkeypatch.setattr(own.actor, "act", lambda *seen, by=by: play(*seen) + np.float32(by))
+        monkeypatch.setattr(export, "exported", lambda _: content)
+        with pytest.raises(RunError, match=why):
+            export.export_run(ExportConfig("runs/one", str(out)))
     own = run(made, seed=1)
     monkeypatch.setattr(export, "exported", lambda _: content)
     with pytest.raises(RunError, match="off torch's, and 1e-05 is the most|and 1280 are ties"):
