@@ -24,7 +24,7 @@ COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_te
 # Neither plays nor learns: the figures of reports.
 LEFT_OUT = {"matplotlib", "pandas"}
 DISTRIBUTIONS = cache(packages_distributions)  # of all that is installed: a second
-EXTRAS = {"av"}  # of films, which no container makes
+EXTRAS = {"av", "onnx", "onnxruntime"}  # of films and exported agents, which no container makes
 
 
 def requirements(name: str) -> set[str]:
