@@ -42,7 +42,7 @@ def run(made: Setup, seed: int = 0) -> Run:
     [
         toy("td3"),
         toy("sac"),
-        setup(PAIR, SCENE, SMALL),
+        pytest.param(setup(PAIR, SCENE, SMALL), marks=pytest.mark.check),
         pytest.param(
             setup(TURNED, {"reapply": 1}, PERCEPTRON, allow_flip=True, mirrored=0.5),
             marks=pytest.mark.check,

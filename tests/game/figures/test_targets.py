@@ -146,7 +146,9 @@ def test_a_hand_takes_figures_of_the_library_alone(tmp_path: Path) -> None:
         _play(composed("play", given))
 
 
-@pytest.mark.parametrize("target", ["cat", "boat.png", "photograph.jpg"])
+@pytest.mark.parametrize(
+    "target", ["cat", pytest.param("boat.png", marks=pytest.mark.check), "photograph.jpg"]
+)
 def test_a_target_is_played_whatever_it_is(
     target: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
