@@ -56,10 +56,10 @@ def export_run(config: ExportConfig, tell: Callable[[str], None] = print) -> int
     found = compared(run, content)
     if not (found.apart <= CLOSE and found.ties <= MOST_TIES * found.count):
         raise RunError(
-            f"{config.out} is not written: an action in {found.count} observations is "
-            f"{found.apart:.1e} off torch's, and {CLOSE:g} is the most, and {found.ties} are ties, "
-            f"of which {MOST_TIES:.0%} are the most: try the versions of onnx "
-            "and onnxruntime that constraints.txt names, or play it by load_run"
+            f"{config.out} is not written, it plays otherwise than torch: an action is "
+            f"{found.apart:.1e} off, {CLOSE:g} is the most; {found.ties} of {found.count} are "
+            f"ties, {MOST_TIES:.0%} is the most: try the versions of onnx and onnxruntime that "
+            "constraints.txt names, or play it by tangram_agent.runs.load_run"
         )
     write_whole(Path(config.out), content)
     spec = run.setup.spec

@@ -74,12 +74,46 @@ def test_an_agent_plays_alike(
     monkeypatch.setattr(export, "exported", lambda _: content)
     play = own.actor.act
     monkeypatch.setattr(own.actor, "act", lambda *seen: play(*seen) - np.float32(5e-5))
-    with pytest.raises(RunError, match="is 5.0e-05 off torch's, and 1e-05 is the most"):
+    with pytest.raises(RunError, match="an action is 5.0e-05 off, 1e-05 is the most"):
         export.export_run(ExportConfig("runs/one", str(out)))
     own = run(made, seed=1)
-    with pytest.raises(RunError, match="off torch's, and 1e-05 is the most|and 1280 are ties"):
+    with pytest.raises(RunError, match="is not written, it plays otherwise"):
         export.export_run(ExportConfig("runs/one", str(out)))
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("node", "options", "why"),
+    [
+        ("Cast", {"to": 11}, "it gives .* float64 for .* float32"),
+        ("Squeeze", {}, r"it gives \(2,\) float32 for \(1, 2\)"),
+        ("Log", {}, "it gives actions that are no numbers"),
+        ("NoSuchNode", {}, "cannot be written as ONNX: .*NoSuchNode"),
+    ],
+)
+def test_what_gives_no_actions_is_refused(node: str, options: dict[str, int], why: str) -> None:
+    """In a file of one node that takes the observation for the action."""
+    kind = onnx.TensorProto.DOUBLE if node == "Cast" else onnx.TensorProto.FLOAT
+    seen = onnx.helper.make_tensor_value_info("observation", onnx.TensorProto.FLOAT, ["rows", 2])
+    action = onnx.helper.make_tensor_value_info("action", kind, None)
+    made = onnx.helper.make_node(node, ["observation"], ["action"], **options)
+    graph = onnx.helper.make_graph([made], "one", [seen], [action])
+    opset = onnx.helper.make_opsetid("", export.OPSET)
+    model = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=9)
+    with pytest.raises(RunError, match=why):
+        export._player(run(toy("td3")), model.SerializeToString())(
+            {"observation": -np.ones((1, 2), "f4")}
+        )
+
+
+def test_a_tie_is_where_torch_plays_so_a_hair_beside() -> None:
+    own = run(toy("td3"))
+    own.actor.act = lambda seen, _: np.where(seen["observation"] > 0, 0.5, -0.5)
+    shown = {name: np.zeros(2, "f4") for name in export.inputs(own)}
+    assert export._is_tie(own, shown, np.array([-0.5, 0.5]))
+    assert not export._is_tie(own, shown, np.array([-0.5, 0.4]))
+    shown["observation"] += 0.01
+    assert not export._is_tie(own, shown, np.array([-0.5, 0.5]))
 
 
 @pytest.mark.parametrize("name", ["hand", "tangram7_silhouette"])
