@@ -3,6 +3,7 @@
 `solution.schema.json` beside this file is for programs that check files.
 """
 
+from math import ceil
 from typing import Literal
 
 import msgspec
@@ -43,10 +44,15 @@ class Token(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Picture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What `pixels` count in: the picture as given, at most 1,280; of outlines one of our own."""
+    """What `pixels` count in: the picture as given; of an SVG its page; else one of our own."""
 
     width: int
     height: int
+
+    @staticmethod
+    def of(page: tuple[float, float]) -> "Picture":
+        """Of a page's width and height, rounded up."""
+        return Picture(ceil(page[0]), ceil(page[1]))
 
 
 class Solution(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

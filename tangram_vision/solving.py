@@ -9,6 +9,7 @@ from tangram_sim.targets.targets import has_all_tans
 from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
 from tangram_vision.silhouettes.approximations import nearest_figure
 from tangram_vision.silhouettes.silhouettes import UNLEARNED, Method
+from tangram_vision.silhouettes.tilts import mapped
 from tangram_vision.solution import Picture, Solution, tokens_of
 
 SECONDS = 5.0  # of a search, and
@@ -37,14 +38,15 @@ class Answer:
 
     def solution(self, layout: Layout, scale: float, source: str) -> Solution:
         """The same as data; the side of the full square is in units of the layout."""
+        own = mapped(self.drawn.own, self.drawn.corners(layout, self.lies))
         return Solution(
             source=source,
             kind="filled" if self.exact else "nearest",
             told=self.told,
             iou=round(self.iou, 6),
             seconds=round(self.seconds, 3),
-            picture=Picture(*self.drawn.picture.size),
-            tokens=tokens_of(layout, scale, self.lies, self.drawn.corners(layout, self.lies)),
+            picture=Picture.of(self.drawn.page),
+            tokens=tokens_of(layout, scale, self.lies, own),
         )
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from PIL import Image
 
@@ -13,18 +14,21 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.targets import turned_figure
 from tangram_tasks.place import Place
 
+if TYPE_CHECKING:  # needs OpenCV
+    from tangram_vision.given.picture_files import Given
+
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
     """What a photograph shows.
 
     Attributes:
-        picture: in colour, upright.
+        given: its picture.
         outlines: (V, 2) corners of the tokens, pixels of the picture, y down.
         figure: the tokens in the middle of a run's arena.
     """
 
-    picture: Image.Image
+    given: "Given"
     outlines: Floats
     figure: Figure
 
@@ -40,18 +44,19 @@ def read_photograph(target: str, task: Place, anywhere: bool = False) -> Photogr
     from tangram_vision.given.picture_files import read_picture  # noqa: PLC0415
 
     source, layout = f"target={target}", task.layout
-    picture = read_picture(Path(target), source)
-    found = find_tokens(picture, layout, source)
+    given = read_picture(Path(target), source)
+    found = find_tokens(given.picture, layout, source)
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
     if not anywhere:
         remedy = "lay tokens nearer together, or write out=solution.json, which needs no arena"
         check_inside(source, task, layout.corners(poses, found.flipped), remedy)
     outlines = layout.corners(found.poses, found.flipped) * (found.unit, -found.unit)
-    return Photograph(picture, outlines, Figure(Path(target).stem, 0.0, poses, found.flipped))
+    figure = Figure(Path(target).stem, 0.0, poses, found.flipped)
+    return Photograph(given, outlines, figure)
 
 
 def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.Image:
     """The photograph with the outlines of what was seen, and how much that was below."""
-    picture = outlined(photograph.picture, layout, photograph.outlines, size)
+    picture = outlined(photograph.given.picture, layout, photograph.outlines, size)
     seen = f"{layout.tokens} tokens" if layout.tokens > 1 else layout.shapes[0].name
     return contact_sheet([picture], 1, [f"seen: {seen.replace('_', ' ')}"])

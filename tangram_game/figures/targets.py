@@ -69,6 +69,7 @@ def solved(target: str, source: str, task: Place, kind: str) -> "Solution":
     layout, scale = task.layout, task.tokens.scale
     if kind != PHOTOGRAPH:
         return answered(target, source, task).solution(layout, scale, target)
+    from tangram_vision.silhouettes.tilts import mapped  # noqa: PLC0415
     from tangram_vision.solution import Picture, Solution, tokens_of  # noqa: PLC0415
 
     seen = read_photograph(target, task, anywhere=True)
@@ -79,6 +80,6 @@ def solved(target: str, source: str, task: Place, kind: str) -> "Solution":
         told="found in the photograph",
         iou=None,
         seconds=None,
-        picture=Picture(*seen.picture.size),
-        tokens=tokens_of(layout, scale, lies, seen.outlines),
+        picture=Picture.of(seen.given.size),
+        tokens=tokens_of(layout, scale, lies, mapped(seen.given.own, seen.outlines)),
     )

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from tangram_core.arrays import Bools, Floats, Ints, Pixels, Singles
+from tangram_core.arrays import Bools, Floats, Ints, Singles
 from tangram_core.errors import ConfigError
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.sight.perception import Look
@@ -82,7 +82,7 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
     Raises:
         ConfigError: says what was found instead.
     """
-    cover = _coverage(np.asarray(picture.convert("L")))
+    cover = _coverage(picture)
     spots = _spots(cover, layout, source)
     unit = float(np.sqrt(spots.cover.sum() / layout.areas.sum()))
     smallest = float(np.sqrt(layout.areas.min()) * unit)
@@ -127,7 +127,7 @@ def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
     Raises:
         ConfigError: it shows none.
     """
-    cover = _coverage(np.asarray(picture.convert("L")))
+    cover = _coverage(picture)
     spots = _spots(cover, layout, source)
     if spots.lacks:
         raise ConfigError(
@@ -204,16 +204,22 @@ def _listed(names: list[str]) -> str:
 # What is covered
 
 
-def _coverage(levels: Pixels) -> Singles:
+def _coverage(picture: Image.Image) -> Singles:
     """(H, W) about 0 on the ground, and about 1 on tokens, each by its own level."""
-    grey = cv2.GaussianBlur(levels, (3, 3), 0).astype(np.float32)
+    grey, *colours = (_smooth(one) for one in (picture.convert("L"), *picture.split()))
     light, noise = _light(grey)
     contrast = _CONTRAST if noise > 1.0 else _CLEAN
     least = max(contrast / 2.0, 4.0 * noise)
     differs = light - grey
-    if np.count_nonzero(differs < -least) > np.count_nonzero(differs > least):  # a dark ground
-        differs = -differs
+    dark = np.count_nonzero(differs < -least) > np.count_nonzero(differs > least)  # a dark ground
+    sign = np.float32(-1.0 if dark else 1.0)
+    differs *= sign
     cover = np.zeros_like(differs)
+    if noise <= 1.0:  # a drawing: yellow on white differs in blue alone, and a shadow has no colour
+        each = [sign * (_light(colour)[0] - colour) for colour in colours]
+        coloured = np.ptp(each, axis=0) > contrast
+        differs = np.maximum(differs, np.max(each, axis=0))
+        cover = cv2.erode(coloured.astype(np.float32), np.ones((3, 3), np.uint8))
     _, label, stats, _ = cv2.connectedComponentsWithStats((differs > least).astype(np.uint8))
     largest = np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")[:_SPOTS] + 1
     for spot in largest.tolist():
@@ -225,6 +231,10 @@ def _coverage(levels: Pixels) -> Singles:
             share = np.clip(0.5 + _STEEP * (differs[own] / level - 0.5), 0.0, 1.0)
             cover[own] = np.maximum(cover[own], np.where(near, share, 0.0))
     return cover
+
+
+def _smooth(channel: Image.Image) -> Singles:
+    return cv2.GaussianBlur(np.asarray(channel), (3, 3), 0).astype(np.float32)
 
 
 def _light(grey: Singles) -> tuple[Singles, float]:

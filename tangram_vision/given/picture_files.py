@@ -3,10 +3,12 @@
 import struct
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.sketches import check_file
 from tangram_vision.given.svg_files import read_svg
@@ -34,8 +36,22 @@ _BROKEN = (
 )
 
 
-def read_picture(path: Path, source: str) -> Image.Image:
-    """A file's picture in colour, upright, at most LONGEST pixels along its longer side.
+class Given(NamedTuple):
+    """A file's picture.
+
+    Attributes:
+        picture: in colour, upright, at most LONGEST pixels along its longer side.
+        size: width and height of the file's own page.
+        own: homography (3, 3) of points of the picture to points of that page.
+    """
+
+    picture: Image.Image
+    size: tuple[float, float]
+    own: Floats
+
+
+def read_picture(path: Path, source: str) -> Given:
+    """A file's picture, and where it lies in the file.
 
     Args:
         path: of the file.
@@ -46,14 +62,18 @@ def read_picture(path: Path, source: str) -> Image.Image:
     """
     check_file(path, source)
     if path.suffix.lower() == ".svg":
-        return _upright(read_svg(path, source))
+        drawn, size, own = read_svg(path, source)
+        picture, share = _upright(drawn)
+        return Given(picture, size, own @ share)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(path, formats=FORMATS) as image:
                 _check_size(image, source)
-                return _upright(image)
+                picture, share = _upright(image)
+                width, height = share.diagonal()[:2] * picture.size
+                return Given(picture, (round(width), round(height)), share)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise ConfigError(_too_large(source)) from None
     except _BROKEN as error:
@@ -79,18 +99,22 @@ def _check_size(image: Image.Image, source: str) -> None:
         )
 
 
-def _upright(image: Image.Image) -> Image.Image:
-    if image.mode.startswith("I"):  # 16 bits of grey
-        levels = np.clip(np.asarray(image) >> 8, 0, 255)
-        image = Image.fromarray(levels.astype(np.uint8))
+def _upright(image: Image.Image) -> tuple[Image.Image, Floats]:
+    """In colour, small enough; and the homography of its points to those before it was small."""
+    if image.mode[0] in "IF":  # grey of more than 8 bits
+        levels = np.nan_to_num(np.asarray(image, np.float64))
+        levels -= levels.min()
+        image = Image.fromarray((levels / (levels.max() or 1.0) * 255.0).astype(np.uint8))
     if image.mode in ("1", "P", "PA", "LA") or "transparency" in image.info:
         image = image.convert("RGBA")
-    image.thumbnail((LONGEST, LONGEST), Image.Resampling.BOX)
     image = ImageOps.exif_transpose(image)
+    width, height = image.size
+    image.thumbnail((LONGEST, LONGEST), Image.Resampling.BOX)
+    own = np.diag([width / image.width, height / image.height, 1.0])
     if image.mode == "RGBA":
         levels = np.asarray(image.convert("LA"), np.float64)
         there = levels[..., 1].sum() or 1.0
         light = there < levels[..., 1].size * 255.0 and levels.prod(axis=-1).sum() / there > _LIGHT
         paper = Image.new("RGBA", image.size, _SLATE if light else _PAPER)
         image = Image.alpha_composite(paper, image)
-    return image.convert("RGB")
+    return image.convert("RGB"), own

@@ -24,7 +24,7 @@ from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_vision.given.outline_files import Drawn, read_outline
 from tangram_vision.given.photos import Shade, find_silhouette
-from tangram_vision.given.picture_files import read_picture
+from tangram_vision.given.picture_files import Given, read_picture
 from tangram_vision.silhouettes.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes.silhouettes import (
     UNLEARNED,
@@ -52,6 +52,8 @@ class Silhouette:
         drawing: homography (3, 3) of points in such units to columns and rows of the picture.
         area: of it, in such units.
         share: its area over that of the tokens where the file tells its scale, and they differ.
+        page: width and height of the file's own page; of outlines it is the picture.
+        own: homography (3, 3) of points of the picture to points of that page.
     """
 
     picture: Image.Image
@@ -59,7 +61,9 @@ class Silhouette:
     filled: Filled
     drawing: Floats
     area: Area
-    share: float | None = None
+    share: float | None
+    page: tuple[float, float]
+    own: Floats
 
     def corners(self, layout: Layout, found: Dissection) -> Floats:
         """(V, 2) of the tokens, columns and rows of the picture."""
@@ -105,7 +109,8 @@ def _from_outline(
     filled = fill_outline(placed, layout, seconds, method)
     mask = _mask(placed, size, unit)
     drawing = np.diag([unit, -unit, 1.0])
-    return Silhouette(_inked(mask), mask, filled, drawing, placed, share if wrong else None)
+    told = share if wrong else None
+    return Silhouette(_inked(mask), mask, filled, drawing, placed, told, size, np.eye(3))
 
 
 def _framed(area: Area, scale: float) -> tuple[Area, tuple[int, int], float]:
@@ -139,10 +144,10 @@ def _inked(mask: Bools) -> Image.Image:
 
 
 def _from_picture(
-    picture: Image.Image, source: str, layout: Layout, seconds: float, method: Method
+    given: Given, source: str, layout: Layout, seconds: float, method: Method
 ) -> Silhouette:
     """The scale is that at which as many pixels are covered as the tokens are large."""
-    shade = _closed(find_silhouette(picture, layout, source))
+    shade = _closed(find_silhouette(given.picture, layout, source))
     if not (shade.cover > 0.5).any():
         raise ConfigError(
             f"{source} shows lines that are too thin to have an area: fill the figure with one tone"
@@ -152,7 +157,8 @@ def _from_picture(
     filled = fill_picture(shade.cover, layout, view, seconds, method)
     drawing = shade.back @ np.diag([1.0 / view, -1.0 / view, 1.0])
     area = _traced(shade.cover, view / len(shade.cover))
-    return Silhouette(picture, _shaded(shade, picture.size), filled, drawing, area)
+    mask = _shaded(shade, given.picture.size)
+    return Silhouette(given.picture, mask, filled, drawing, area, None, given.size, given.own)
 
 
 def _closed(shade: Shade) -> Shade:

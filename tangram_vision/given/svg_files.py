@@ -15,9 +15,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from PIL import Image
 
-from tangram_core.arrays import AnyArray
+from tangram_core.arrays import AnyArray, Floats
 from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.sketches import read_text
+from tangram_vision.silhouettes.tilts import shift
 
 SIDE = 2400  # pixels of a square that the whole drawing goes into
 SECONDS, BYTES = 10, 2 << 30  # that drawing may take
@@ -41,8 +42,13 @@ sys.stdout.buffer.write(bytes(drawn))
 """
 
 
-def read_svg(path: Path, source: str) -> Image.Image:
+def read_svg(path: Path, source: str) -> tuple[Image.Image, tuple[float, float], Floats]:
     """What a file draws, black on white, with a border around it.
+
+    Returns:
+        The picture; width and height of the page, in units of its viewBox; and the homography
+        (3, 3) of points of the picture to those of the page, from its upper left corner. If the
+        page is not told in numbers, or stretched, it is the picture itself.
 
     Raises:
         ConfigError: it cannot be used, and why.
@@ -54,16 +60,28 @@ def read_svg(path: Path, source: str) -> Image.Image:
     if not len(there[0]):
         raise ConfigError(f"{source} draws nothing that has an area: draw an outline")
     (left, *_, right), (top, *_, low) = (one[[0, -1]] for one in there)
+    page = _page(root)
+    told = [re.match(r"[\d.]+(?!.*%)", root.get(name, "")) for name in ("width", "height")]
     shown = pixels[top : low + 1, left : right + 1]
     figure = _figure(shown)
     # A page of another colour than white would be a figure itself.
-    page = max(shown.shape[:2]) >= SIDE - 1 and shown[..., 3].all()
-    if not (page and (shown[0, 0, :3] < 256 - _SEEN).any()) and _reaches_out(root, source):
+    opaque = max(shown.shape[:2]) >= SIDE - 1 and shown[..., 3].all()
+    if not (opaque and (shown[0, 0, :3] < 256 - _SEEN).any()) and _reaches_out(root, page, source):
         raise ConfigError(
             f"{source} is cut off: it reaches out of its page: enlarge its viewBox, or width "
             "and height"
         )
-    return Image.fromarray(np.where(np.pad(figure, _BORDER), 0, 255).astype(np.uint8))
+    picture = Image.fromarray(np.where(np.pad(figure, _BORDER), 0, 255).astype(np.uint8))
+    if page is None:
+        return picture, picture.size, np.eye(3)
+    width, height = page[2:].tolist()
+    wide, high = (float(one[0]) for one in told if one) if all(told) else (width, height)
+    if not np.isclose(wide * height, high * width, rtol=0.01):  # stretched, or with more around it
+        return picture, picture.size, np.eye(3)
+    unit = SIDE / max(width, height)
+    # The page has its middle in that of the square.
+    right, down = np.array([left, top]) - _BORDER - SIDE / 2.0 + unit * page[2:] / 2.0
+    return picture, (width, height), np.diag([1.0 / unit, 1.0 / unit, 1.0]) @ shift(right, down)
 
 
 def _figure(pixels: AnyArray) -> AnyArray:
@@ -103,19 +121,26 @@ def _drawn(text: str, source: str) -> AnyArray:
     return drawn
 
 
-def _reaches_out(root: ET.Element, source: str) -> bool:
-    """Whether something is drawn beyond the page, without a rectangle that covers the page.
-
-    Not known, so no, where the page is not told in numbers or something is sized by it.
-    """
+def _page(root: ET.Element) -> Floats | None:
+    """(4,) left, top, width and height of the page in its own units; None if it does not tell."""
     told = root.get("viewBox") or "0 0 {} {}".format(
         *((root.get(name) or "").removesuffix("px") for name in ("width", "height"))
     )
     try:
-        page = [float(one) for one in re.split(r"[\s,]+", told.strip())]
-        x, y, width, height = page
+        page = np.array([float(one) for one in re.split(r"[\s,]+", told.strip())])
     except ValueError:
+        return None
+    return page if page.shape == (4,) and page[2:].min() > 0.0 else None
+
+
+def _reaches_out(root: ET.Element, page: Floats | None, source: str) -> bool:
+    """Whether something is drawn beyond the page, without a rectangle that covers the page.
+
+    Not known, so no, where the page is not told in numbers or something is sized by it.
+    """
+    if page is None:
         return False
+    x, y, width, height = page.tolist()
     for parent in root.iter():
         for child in [one for one in parent if one.get("width") == one.get("height") == "100%"]:
             parent.remove(child)
@@ -151,6 +176,9 @@ def _checked(text: str, source: str) -> ET.Element:
         raise ConfigError(
             f"{source} is not XML ({error}): save it anew as SVG, or give a PNG of it"
         ) from None
+    for parent in [*root.iter()]:
+        for child in [one for one in parent if str(one.tag).endswith("metadata")]:
+            parent.remove(child)
     tags = [str(element.tag).rpartition("}")[2] for element in root.iter()]
     if tags[0] != "svg":
         raise ConfigError(f"{source} is no <svg> but a <{tags[0]}>: save the <svg> in it alone")
@@ -158,8 +186,10 @@ def _checked(text: str, source: str) -> ET.Element:
         raise ConfigError(f"{source} has an element <{tag}>: {_REFUSED[tag]}")
     styles = [one.get("style", "") for one in root.iter()]
     styles += [one.text or "" for one in root.iter() if str(one.tag).endswith("style")]
-    if any(re.search(r"(?<![-\w])transform\s*:(?!\s*none)", style) for style in styles):
+    moves = r"(?<![-\w])(transform|rotate|scale|translate)\s*:(?!\s*none)"
+    if any(re.search(moves, style) for style in styles):
         raise ConfigError(
-            f"{source} has a style with a transform: write it as an attribute, without px and deg"
+            f"{source} has a style with a transform, rotate, scale or translate: write it as the "
+            "attribute transform, without px and deg"
         )
     return root

@@ -159,7 +159,8 @@ CASES: dict[str, tuple[Given, ...]] = {
         svg(SVG.replace("</svg>", '<path d="M90 90V80H91V90Z"/></svg>')),
     ),
     "an element <image>: give the picture itself": (svg(IMAGE), png(b64decode(DATA))),
-    "a style with a transform: write it as an attribute, without px and deg": (
+    "a style with a transform, rotate, scale or translate: write it as the attribute transform, "
+    "without px and deg": (
         svg(SQUASHED),
         svg(re.sub('style="transform:(.*?)px(.*?)px', r'transform="\1\2', SQUASHED)),
     ),

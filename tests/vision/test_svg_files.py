@@ -5,9 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from PIL import Image
 
+from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_vision.given.svg_files import read_svg
+from tangram_vision.silhouettes.tilts import mapped
 
 pytestmark = pytest.mark.fast
 
@@ -21,9 +24,13 @@ XMLNS = 'xmlns="http://www.w3.org/2000/svg"'
 
 
 def read(folder: Path, content: str) -> np.ndarray:
+    return np.asarray(read_whole(folder, content)[0])
+
+
+def read_whole(folder: Path, content: str) -> tuple[Image.Image, tuple[float, float], Floats]:
     path = folder / "it.svg"
     path.write_text(content)
-    return np.asarray(read_svg(path, f"silhouette={path.name}"))
+    return read_svg(path, f"silhouette={path.name}")
 
 
 @pytest.mark.parametrize(
@@ -91,6 +98,32 @@ def test_whatever_differs_from_the_ground_is_the_figure(tmp_path: Path, content:
     high, wide = np.ptp(rows) + 1, np.ptp(columns) + 1
     assert high == pytest.approx(wide, rel=0.02)
     assert (pixels < 128).sum() == pytest.approx(np.pi / 4 * high * wide, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("page", "size", "moved"),
+    [
+        ('viewBox="0 0 300 200"', (300, 200), 0),
+        ('viewBox="-50 -50 300 300" width="9cm" height="9cm"', (300, 300), 50),
+        ('width="250px" height="300"', (250, 300), 0),
+    ],
+)
+def test_a_point_of_the_picture_is_known_in_the_file(
+    tmp_path: Path, page: str, size: tuple[int, int], moved: int
+) -> None:
+    drawn, found, own = read_whole(tmp_path, f"<svg {XMLNS} {page}>{HALF}</svg>")
+    dark = np.asarray(drawn) < 128
+    (left, *_, right), (top, *_, low) = (np.flatnonzero(dark.any(axis=axis)) for axis in (0, 1))
+    corners = mapped(own, np.array([[left, top], [right + 1.0, low + 1.0]]))
+    assert found == size
+    assert corners.tolist() == [pytest.approx([end + moved] * 2, abs=0.3) for end in (10, 110)]
+
+
+def test_a_page_that_is_not_told_or_stretched_is_the_picture(tmp_path: Path) -> None:
+    for page in ("", 'width="9cm" height="9cm"', 'viewBox="0 0 300 300" width="9cm" height="5cm"'):
+        drawn, size, own = read_whole(tmp_path, f"<svg {XMLNS} {page}>{HALF}</svg>")
+        assert size == drawn.size
+        assert own.tolist() == np.eye(3).tolist()
 
 
 @pytest.mark.parametrize("ground", ["", '<rect width="100%" height="100%" fill="white"/>'])

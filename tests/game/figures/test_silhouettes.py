@@ -61,7 +61,7 @@ def read(name: str) -> object:
     "name",
     [
         *("cat", "cat.png", "dark.jpg", "pale.webp", "cat.gif", "white.png", "lines.png"),
-        *("square.svg", "pieces.svg"),
+        *("square.svg", "pieces.svg", "levels.tif", "colours.png"),
     ],
 )
 def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: str) -> None:
@@ -75,6 +75,15 @@ def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: st
     lines = Image.new("L", (300, 300), 255)
     ImageDraw.Draw(lines).polygon([(50, 90), (210, 50), (250, 210), (90, 250)], None, 0, 3)
     lines.save(tmp_path / "lines.png")
+    levels = np.asarray(lines.resize((301, 300)), np.float32)
+    Image.fromarray(levels / 255.0).save(tmp_path / "levels.tif")
+    colours = Image.new("RGB", (300, 300), "white")
+    for ink, corners in (
+        ("navy", (50, 50, 250, 50, 250, 250)),
+        ("pink", (50, 50, 50, 250, 250, 250)),
+    ):
+        ImageDraw.Draw(colours).polygon(corners, ink)
+    colours.save(tmp_path / "colours.png")
     svg(tmp_path / "square.svg", SQUARE)
     svg(tmp_path / "pieces.svg", '<polygon points="0,0 8,0 8,8"/><polygon points="0,0 8,8 0,8"/>')
     source = name if name == "cat" else str(tmp_path / name)

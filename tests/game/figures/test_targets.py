@@ -108,6 +108,22 @@ def test_a_solution_fills_what_it_says_it_fills(target: str, tmp_path: Path) -> 
     assert [one.order for one in found.tokens] == list(range(1, 8))
 
 
+@pytest.mark.parametrize("kind", ["filled", "seen"])
+def test_pixels_count_in_the_picture_as_given(kind: str, tmp_path: Path) -> None:
+    """A large one, on its side; or the file of a photograph."""
+    path, turned = tmp_path / "large.png", Image.Exif()
+    name = "silhouette.png" if kind == "filled" else "photograph.jpg"
+    with Image.open(PICTURES / name) as shown:
+        large = shown.convert("L").resize((2000, 1000 * 2 * shown.height // shown.width))
+    turned[274] = 6  # shown a quarter to the right
+    large.save(path, exif=turned)
+    assert _play(composed("play", [f"target={path}", f"out={tmp_path}/it.json"])) == 0
+    found = read_solution(tmp_path / "it.json")
+    assert (found.kind, found.picture.width) == (kind, large.height)
+    ink = np.asarray(large.rotate(-90, expand=True)) < 128
+    assert filled_again(found, ink) > 0.9
+
+
 def test_a_photograph_tells_where_tokens_were_seen(tmp_path: Path) -> None:
     out = tmp_path / "seen.json"
     assert _play(composed("play", [f"target={PICTURES}/photograph.jpg", f"out={out}"])) == 0
