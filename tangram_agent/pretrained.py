@@ -1,7 +1,7 @@
 """Agents that come with the package: `pretrained/<name>` wherever a run folder is expected.
 
 An agent's folder holds `config.yaml` (the sections that make a setup), `weights.safetensors` (the
-acting actor alone), `card.json` and `card.md`. `tangram_lab.experiments.pretrained` makes such
+acting actor alone), and `card.json`. `tangram_lab.experiments.pretrained` makes such
 folders; one that lies anywhere else is read in the same way.
 """
 
@@ -19,7 +19,6 @@ PREFIX = "pretrained"
 CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"
 CARD = "card.json"
-CARD_TEXT = "card.md"
 FORMAT = 2
 PACKAGED: Traversable = files("tangram_agent") / PREFIX
 

@@ -18,7 +18,7 @@ import safetensors.numpy
 import torch
 import yaml
 
-from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
+from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS
 from tangram_agent.runs import Run, load_run
 from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_core.settings import told
@@ -93,7 +93,6 @@ def publish(
     content = yaml.safe_dump(chosen.run.setup.config(), sort_keys=False)
     write_whole(folder / CONFIG, content.encode())
     write_whole(folder / WEIGHTS, weights)
-    write_whole(folder / CARD_TEXT, card_text(card).encode())
     write_whole(folder / CARD, (json.dumps(card, indent=1) + "\n").encode())
     return folder
 
@@ -166,25 +165,15 @@ def _weights(run: Run) -> bytes:
 
 # The card: what made the agent, and what it can do
 
-Scores = Mapping[str, Any]
-
 # What result.json says of a run's effort, for the card.
 _BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "workers")
 
-# Scores of the card's tables: name -> label, digits.
-_ROWS = {
-    "solved": ("all tokens in place, share of tests", 3),
-    "placed": ("tokens in place, share", 3),
-    "pushes": ("pushes", 1),
-    "mean_reward": ("mean reward, exact polygons, -1 to 1", 4),
-    "raw_overlap": ("coverage, 0 to 1", 4),
-    "raw_overlap_p10": ("coverage, 10th percentile", 4),
-    "share_solved": ("share of targets covered by 0.95 or more", 3),
-    "share_solved_iou": ("share with an intersection over union of 0.95 or more", 3),
-    "iou": ("intersection over union", 4),
-    "angle_error_deg_median": ("angle error, median, degrees", 3),
-    "position_error_median": ("position error, median, arena units", 4),
-}
+# Its scores of each seed.
+_SCORES = (
+    *("solved", "placed", "pushes", "mean_reward", "raw_overlap", "raw_overlap_p10"),
+    *("share_solved", "share_solved_iou", "iou"),
+    *("angle_error_deg_median", "position_error_median"),
+)
 
 
 def make_card(name: str, chosen: Candidate, seeds: Sequence[Candidate]) -> dict[str, Any]:
@@ -211,7 +200,7 @@ def make_card(name: str, chosen: Candidate, seeds: Sequence[Candidate]) -> dict[
         **_picked(result, "updates", "seed", "episodes", "transitions", "test_episodes"),
         "selection": f"median of the seeds by final {_ranks(result)} (the lower one of two)",
         "seeds": [
-            {key: one.result.get(key) for key in ("seed", "train_s", *_ROWS)} for one in seeds
+            {key: one.result.get(key) for key in ("seed", "train_s", *_SCORES)} for one in seeds
         ],
         **_picked(result, "commit", "versions"),
     }
@@ -219,60 +208,6 @@ def make_card(name: str, chosen: Candidate, seeds: Sequence[Candidate]) -> dict[
 
 def _picked(result: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: result[name] for name in names}
-
-
-def card_text(card: Mapping[str, Any]) -> str:
-    """card.md: the same for people."""
-    name, budget, seeds, tests = card["name"], card["budget"], card["seeds"], card["tests"]
-    names = [f"seed {one['seed']}{' (this one)' * (one['seed'] == card['seed'])}" for one in seeds]
-    compared = {"this agent" if one == RUN else one: s for one, s in tests["scores"].items()}
-    figures = {f"{split} split": one["scores"] for split, one in card.get("puzzles", {}).items()}
-    puzzles = f"\nOn the figures of tangram_sim/puzzles:\n\n{_table(figures)}\n" if figures else ""
-    return f"""\
-# {PREFIX}/{name}
-
-An agent for {", ".join(card["tokens"])} (full square of side {card["scale"]:g}). Agent \
-`{card["agent"]}`, network `{card["net"]}` with {card["parameters"]["acting"]:,} parameters. \
-Licence: {card["licence"]}. \
-`config.yaml` has the world that it was trained in; another task needs another training.
-
-```bash
-tangram-eval run_dir={PREFIX}/{name} episodes={tests["episodes"]} seed={tests["seed"]}
-tangram-play run_dir={PREFIX}/{name} out={name}.gif
-```
-
-## Training
-
-- {card["episodes"]:,} episodes with {card["transitions"]:,} transitions, simulated here.
-- {budget["updates"]:,} updates in {budget["train_s"]:.0f} s, {budget["wall_s"]:.0f} s in all, on \
-{budget["cores"]} cores ({budget["processor"]}), device {budget["device"]}, \
-workers {budget["workers"]}.
-- Commit {card["commit"] or "unknown"}; \
-{", ".join(f"{package} {number}" for package, number in card["versions"].items())}.
-
-## Evaluation
-
-All seeds on the {card["test_episodes"]:.0f} fixed tests of the training; what ships is the \
-{card["selection"]}.
-
-{_table(dict(zip(names, seeds, strict=True)))}
-
-This agent on {tests["episodes"]} other tests (seed {tests["seed"]}), beside policies that \
-learned nothing:
-
-{_table(compared)}
-{puzzles}"""
-
-
-def _table(columns: Mapping[str, Scores]) -> str:
-    """Markdown: a row for each score, a column for each name."""
-    lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
-    for key, (label, digits) in _ROWS.items():
-        values = [scores.get(key) for scores in columns.values()]
-        if any(value is not None for value in values):
-            shown = ["-" if value is None else f"{value:.{digits}f}" for value in values]
-            lines.append(f"| {label} | " + " | ".join(shown) + " |")
-    return "\n".join(lines)
 
 
 def main() -> int:

@@ -123,7 +123,7 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
     scores = card["tests"]["scores"]["this run"]  # as it ships
     assert scores["placed"] > 0.6 if name == "hand" else scores["mean_reward"] > 0.9
     assert len((folder / WEIGHTS).read_bytes()) < 1_000_000
-    assert f"# pretrained/{name}\n" in (folder / "card.md").read_text()
+    assert card["name"] == name
 
 
 @pytest.mark.parametrize(
