@@ -8,14 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from tangram_core.arrays import Complex, Floats, Singles
-from tangram_vision.pictures.contacts import Contact, closing
 from tangram_vision.pictures.kinds import Kind
 
 _ROUNDS = 6
 _STIFF = 1e-3
 _LONGEST = 0.7  # pixels of one step
 _ENOUGH = 0.01  # pixels
-_PULL = 3.0  # squares of a contact's gap count as much as those of so many pixels
 
 
 def ramps(kinds: Sequence[Kind], poses: Floats, pixels: int) -> Floats:
@@ -29,22 +27,18 @@ def ramps(kinds: Sequence[Kind], poses: Floats, pixels: int) -> Floats:
     )
 
 
-def fitted(
-    kinds: Sequence[Kind], poses: Floats, cover: Singles, contacts: Sequence[Contact] = ()
-) -> tuple[Floats, float]:
+def fitted(kinds: Sequence[Kind], poses: Floats, cover: Singles) -> tuple[Floats, float]:
     """Poses (n, 3) by least squares, and what then is unlike.
 
     Args:
         kinds: n.
         poses: rough ones.
         cover: (P, P) coverage by these tokens.
-        contacts: edges that lie against each other.
     """
     seen, z = cover.ravel().astype(np.float64), _centres(len(cover))
     poses = poses.copy()
     # A step turns by as much as moves a token's edges by a pixel.
     size = np.array([np.sqrt(kind.area) / 2.0 for kind in kinds])
-    units = np.column_stack([np.ones((len(kinds), 2)), 1.0 / size]).ravel()
     for _ in range(_ROUNDS):
         rest, change = seen.copy(), np.empty((3 * len(kinds), len(z)))
         for n, (kind, pose) in enumerate(zip(kinds, poses, strict=True)):
@@ -57,12 +51,7 @@ def fitted(
             change[3 * n + 2] = (out.conj() * 1j * place).real / size[n]
         matrix = change @ change.T
         matrix += _STIFF * np.diag(np.diag(matrix)) + 1e-9 * np.eye(len(matrix))
-        right = change @ rest
-        if contacts:
-            missing, pull = closing(kinds, poses, contacts)
-            matrix += _PULL * (pull * units).T @ (pull * units)
-            right += _PULL * (pull * units).T @ missing
-        step = np.clip(np.linalg.solve(matrix, right), -_LONGEST, _LONGEST).reshape(-1, 3)
+        step = np.clip(np.linalg.solve(matrix, change @ rest), -_LONGEST, _LONGEST).reshape(-1, 3)
         step[:, 2] /= size
         poses += step
         if np.abs(step).max() < _ENOUGH:

@@ -27,7 +27,6 @@ from tangram_sim.geometry.dissections import (
     without,
 )
 from tangram_sim.geometry.layout import Layout
-from tangram_vision.pictures.contacts import touching
 from tangram_vision.pictures.kinds import Kind, kinds_of
 from tangram_vision.pictures.ramps import fitted, ramps
 from tangram_vision.silhouettes.beams import Beam
@@ -206,9 +205,7 @@ class _Explainer:
             for k, flipped in enumerate(found.flipped.tolist())
         ]
         size = (self._unit, self._unit, 1.0)
-        free, _ = fitted(kinds, found.poses / size, self._cover)
-        # Tokens that are nowhere held by others can follow the pixels of what is not theirs.
-        poses, differs = fitted(kinds, free, self._cover, touching(kinds, free))
+        poses, differs = fitted(kinds, found.poses / size, self._cover)
         if self.best is None or differs < self.best.differs:
             self.best = _Explained(replace(found, poses=poses * size), kinds, poses, differs, by)
         return self.best.differs < _ALIKE and _overlap(self.best, self._cover) >= SOLVED
