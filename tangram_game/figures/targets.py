@@ -31,8 +31,10 @@ def told_apart(target: str, task: Place) -> str:
         ConfigError: there is no such file, or it is a photograph that lacks tokens.
     """
     path, source = Path(target), f"target={target}"
-    if not path.suffix:
+    if not path.suffix and not path.is_file():
         return PUZZLE
+    if not path.suffix:
+        raise ConfigError(f"{source} has no ending: name a picture {path.name}.png, say")
     check_file(path, source)
     if path.suffix.lower() == ".json":
         content = loaded(read_text(path, source), source)
