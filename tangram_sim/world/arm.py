@@ -6,7 +6,6 @@ against its peg is small beside its motors and is left out: they follow the peg,
 Lengths are metres, the table's middle is the origin, z is up. Legend: N moments, W way points.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from tangram_core.arrays import Floats
-from tangram_core.errors import TangramError
-from tangram_sim.world.engine import pybullet
+from tangram_sim.world.engine import Client, pybullet
 
 METRES = 0.2  # of an arena unit: a table 0.4 m wide lies where the arm reaches all of it
 LIFTED, LOWERED = 0.06, 0.008  # heights of the peg's tip
@@ -64,17 +62,14 @@ def duration(part: str, length: float) -> float:
     return 1.5 * length / _SPEEDS[part]
 
 
-class Panda:
+class Panda(Client):
     """An arm at the table's left side."""
 
     def __init__(self) -> None:
         """Set it up, above the table's middle."""
         import pybullet_data  # noqa: PLC0415 - comes with pybullet, and takes its time
 
-        self.client = pybullet.connect(pybullet.DIRECT)
-        if self.client < 0:
-            raise TangramError("PyBullet has no client left (it offers 1024 in one process)")
-        self._finalizer = weakref.finalize(self, pybullet.disconnect, self.client)
+        super().__init__()
         model = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
         one = {"physicsClientId": self.client}
         self.body: int = pybullet.loadURDF(str(model), BASE, useFixedBase=True, **one)
@@ -118,10 +113,6 @@ class Panda:
             here = there
         times, tips, angles, parts = zip(*found, strict=True)
         return Motion(np.array(times), np.array(tips), np.array(angles), parts)
-
-    def close(self) -> None:
-        """End the client; calling it twice does no harm."""
-        self._finalizer()
 
     def _moved(self, aim: Floats) -> tuple[Floats, Floats]:
         """Joints' angles and speeds (7,), a step later."""

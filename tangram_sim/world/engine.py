@@ -1,8 +1,11 @@
 """PyBullet, without the line about its build that it prints whenever it is imported."""
 
 import os
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from tangram_core.errors import TangramError
 
 
 @contextmanager
@@ -26,4 +29,25 @@ def _quiet() -> Iterator[None]:
 with _quiet():
     import pybullet
 
-__all__ = ["pybullet"]
+__all__ = ["Client", "pybullet"]
+
+
+class Client:
+    """One PyBullet client of its own, in DIRECT mode, for whatever moves bodies.
+
+    Attributes:
+        client: its number.
+    """
+
+    def __init__(self) -> None:
+        self.client: int = pybullet.connect(pybullet.DIRECT)
+        if self.client < 0:
+            raise TangramError(
+                "PyBullet has no client left (it offers 1024 in one process): close environments, "
+                "or use fewer of them"
+            )
+        self._finalizer = weakref.finalize(self, pybullet.disconnect, self.client)
+
+    def close(self) -> None:
+        """Give the client back; again is no harm."""
+        self._finalizer()

@@ -5,20 +5,18 @@ The engine always sees an arena of width 2, whatever the arena's unit: its toler
 """
 
 import math
-import weakref
 from collections.abc import Sequence
 
 import numpy as np
 
 from tangram_core.arrays import Bools, Floats, Pixels
-from tangram_core.errors import TangramError
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.prisms import ENGINE_ARENA, inset, prism, thickness
 from tangram_sim.geometry.shapes import Shape
 from tangram_sim.sight.pictures import BACKGROUND, TOKEN_GRAY, averaged, taken_pixels
 from tangram_sim.world.camera import Camera
-from tangram_sim.world.engine import pybullet
+from tangram_sim.world.engine import Client, pybullet
 
 _HALF_HEIGHT = 0.01  # of a token as it is drawn
 # Of a token as it collides, where there are others: so tall that the shortest way out of another
@@ -44,7 +42,7 @@ _SUBSTEPS = 8
 _Command = tuple[float, float, float]
 
 
-class PhysicsWorld:
+class PhysicsWorld(Client):
     """Prisms in one PyBullet client of their own, in DIRECT mode. See `World`.
 
     The bodies are made once and only moved: `resetSimulation` in a loop leaks memory.
@@ -52,13 +50,7 @@ class PhysicsWorld:
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
         self._unit = ENGINE_ARENA / sim.arena
-        self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise TangramError(
-                "PyBullet has no client left (it offers 1024 in one process): "
-                "close environments, or use fewer of them"
-            )
-        self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
+        super().__init__()
         self._alone = layout.tokens == 1
         self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
         self._bodies = [self._make_body(shape) for shape in layout.shapes]
@@ -68,7 +60,7 @@ class PhysicsWorld:
         if sim.pixels:
             self._pixels = sim.pixels
             shown = ENGINE_ARENA * sim.view
-            self._camera = Camera(self._client, taken_pixels(sim), shown, _HALF_HEIGHT)
+            self._camera = Camera(self.client, taken_pixels(sim), shown, _HALF_HEIGHT)
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""
@@ -97,10 +89,6 @@ class PhysicsWorld:
         """See `World.picture`."""
         return averaged(self._camera.picture(), self._pixels)
 
-    def close(self) -> None:
-        """See `World.close`."""
-        self._finalizer()
-
     def _command(self, velocity: Floats) -> _Command:
         x, y, angular = np.asarray(velocity, dtype=np.float64).tolist()
         return x * self._unit, y * self._unit, angular
@@ -124,17 +112,17 @@ class PhysicsWorld:
             self._flipped[token] ^= flip
             self._put(token, *pose, height=height)
         self._set_velocity(token, *command)
-        pybullet.stepSimulation(physicsClientId=self._client)
+        pybullet.stepSimulation(physicsClientId=self.client)
         self._stop_all()
 
     def _settle(self) -> None:
         """Push overlapping tokens apart, without momentum."""
-        pybullet.performCollisionDetection(physicsClientId=self._client)
+        pybullet.performCollisionDetection(physicsClientId=self.client)
         self._play_steps_of(_SETTLE_S)
         for _ in range(_SETTLE_STEPS):
             if self._depth() <= _SETTLED:
                 break
-            pybullet.stepSimulation(physicsClientId=self._client)
+            pybullet.stepSimulation(physicsClientId=self.client)
             self._stop_all()
         self._play_at_once()
 
@@ -147,11 +135,11 @@ class PhysicsWorld:
         """
         for token in range(len(self._bodies)):
             self._put(token, 0.0, 0.0, 0.0, height=(token + 1) * _LIFTED)
-        pybullet.performCollisionDetection(physicsClientId=self._client)
+        pybullet.performCollisionDetection(physicsClientId=self.client)
 
     def _depth(self) -> float:
         """The largest depth by which two tokens overlap, in engine units."""
-        contacts = pybullet.getContactPoints(physicsClientId=self._client)
+        contacts = pybullet.getContactPoints(physicsClientId=self.client)
         return max((-contact[_DISTANCE] for contact in contacts), default=0.0)
 
     def _stop_all(self) -> None:
@@ -166,13 +154,13 @@ class PhysicsWorld:
             contactERP=_RECOVERY,
             contactSlop=0.0,
             deterministicOverlappingPairs=1,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
 
     def _play_steps_of(self, seconds: float) -> None:
         """Let one call of stepSimulation play one step of `seconds`."""
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=seconds, numSubSteps=0, physicsClientId=self._client
+            fixedTimeStep=seconds, numSubSteps=0, physicsClientId=self.client
         )
 
     def _make_body(self, shape: Shape) -> int:
@@ -181,7 +169,7 @@ class PhysicsWorld:
         collision = pybullet.createCollisionShape(
             pybullet.GEOM_MESH,
             vertices=prism(inset(corners, margin), _WALL)[0],
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         vertices, triangles = prism(corners, _HALF_HEIGHT)
         gray = TOKEN_GRAY / BACKGROUND
@@ -190,10 +178,10 @@ class PhysicsWorld:
             vertices=vertices,
             indices=triangles,
             rgbaColor=(gray, gray, gray, 1.0),
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         mass = shape.area * self._unit**2
-        body: int = pybullet.createMultiBody(mass, collision, visual, physicsClientId=self._client)
+        body: int = pybullet.createMultiBody(mass, collision, visual, physicsClientId=self.client)
         pybullet.changeDynamics(
             body,
             -1,
@@ -202,26 +190,26 @@ class PhysicsWorld:
             # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
             linearDamping=0.0,
             angularDamping=0.0,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         if self._alone:
-            pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
+            pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self.client)
         return body
 
     def _keep_upright(self, body: int) -> None:
         """Keep the inertia about the vertical alone, so that a body never tips over."""
-        mass, _, inertia, *_ = pybullet.getDynamicsInfo(body, -1, physicsClientId=self._client)
+        mass, _, inertia, *_ = pybullet.getDynamicsInfo(body, -1, physicsClientId=self.client)
         pybullet.changeDynamics(
             body,
             -1,
             mass=mass,
             localInertiaDiagonal=(_UPRIGHT, _UPRIGHT, inertia[2]),
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
 
     def _set_velocity(self, token: int, x: float, y: float, angular: float) -> None:
         pybullet.resetBaseVelocity(
-            self._bodies[token], (x, y, 0.0), (0.0, 0.0, angular), physicsClientId=self._client
+            self._bodies[token], (x, y, 0.0), (0.0, 0.0, angular), physicsClientId=self.client
         )
 
     def _put(self, token: int, x: float, y: float, angle: float, height: float = 0.0) -> None:
@@ -231,7 +219,7 @@ class PhysicsWorld:
             self._bodies[token],
             (x, y, height),
             (cos, sin, 0.0, 0.0) if self._flipped[token] else (0.0, 0.0, sin, cos),
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
 
     def _put_all(self, poses: Sequence[tuple[float, float, float]]) -> None:
@@ -241,7 +229,7 @@ class PhysicsWorld:
     def _pose(self, token: int) -> tuple[float, float, float]:
         """Position in engine units, and the angle in (-pi, pi]."""
         (x, y, _), (a, b, c, d) = pybullet.getBasePositionAndOrientation(
-            self._bodies[token], physicsClientId=self._client
+            self._bodies[token], physicsClientId=self.client
         )
         sine, cosine = (b, a) if self._flipped[token] else (c, d)
         # q and -q are one rotation: with cosine >= 0 the angle lies in (-pi, pi].

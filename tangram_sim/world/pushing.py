@@ -12,7 +12,6 @@ Lengths are arena units, in which the table is 2 wide. Legend: K tokens.
 """
 
 import math
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -20,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from tangram_core.arrays import Bools, Floats
-from tangram_core.errors import TangramError
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.prisms import inset, prism
-from tangram_sim.world.engine import pybullet
+from tangram_sim.world.engine import Client, pybullet
 
 # Of a token as it collides: so tall that the shortest way out of another is always sideways.
 _WALL = 0.25
@@ -56,7 +54,7 @@ class Unknowns:
     centres: Floats
 
 
-class PushTable:
+class PushTable(Client):
     """Bodies in one PyBullet client of their own, in DIRECT mode."""
 
     def __init__(self, layout: Layout, finger: float) -> None:
@@ -69,13 +67,7 @@ class PushTable:
         self._layout, self._finger = layout, finger
         self._prisms = [prism(inset(shape.corners, _MARGIN), _WALL)[0] for shape in layout.shapes]
         self._gyration = [_gyration(shape.corners) for shape in layout.shapes]
-        self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise TangramError(
-                "PyBullet has no client left (it offers 1024 in one process): close environments, "
-                "or use fewer of them"
-            )
-        self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
+        super().__init__()
         self._bodies: dict[int, int] = {}  # token -> body
 
     def place(self, poses: Floats, present: Bools, unknowns: Unknowns) -> None:
@@ -144,12 +136,8 @@ class PushTable:
             poses[token] = self._pose(token)
         return poses
 
-    def close(self) -> None:
-        """End the client; calling it twice does no harm."""
-        self._finalizer()
-
     def _call(self, name: str, *given: Any, **named: Any) -> Any:
-        return getattr(pybullet, name)(*given, **named, physicsClientId=self._client)
+        return getattr(pybullet, name)(*given, **named, physicsClientId=self.client)
 
     def _finger_at(self, place: Floats, height: float) -> None:
         for joint, value in enumerate((*place.tolist(), height)):

@@ -49,9 +49,9 @@ def make() -> Iterator[Make]:
 def check_at_rest(world: PhysicsWorld) -> None:
     """No body moves, and each lies flat on the table."""
     for body in world._bodies:
-        (_, _, height), turn = pybullet.getBasePositionAndOrientation(body, world._client)
+        (_, _, height), turn = pybullet.getBasePositionAndOrientation(body, world.client)
         assert np.abs([height, *turn[:2]]).max() < 1e-5
-        assert not np.any(pybullet.getBaseVelocity(body, world._client))
+        assert not np.any(pybullet.getBaseVelocity(body, world.client))
 
 
 def set_down(
