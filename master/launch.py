@@ -15,7 +15,7 @@ from master.config import MasterConfig
 from master.forking import warm_up
 from master.hub.security import listening_place
 from master.record.resumable import check_resumable
-from master.record.rundir import RunFolder
+from master.record.rundir import LAUNCHER, RunFolder
 from master.signals import SAME_WISH_S, SIGNALS, show_cursor, stop_notice
 from master.watch.console import logging_to, sturdy_console
 from master.watch.result import show_finished
@@ -52,15 +52,23 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
     """
     folder = RunFolder(config.run_dir)
     folder.prepare(config.resume)
-    with folder.lock():
-        check_resumable(folder, resolved)
-        listening_place(config.service.bind, folder.path)
-        finished = folder.has_finished(config)
-        if not finished:
-            folder.logs.mkdir(exist_ok=True)
-            folder.write_config(resolved)
-            # Left by a master that was killed; workers must wait for the new one.
-            folder.connection.unlink(missing_ok=True)
+    # Between this lock's end and the master's own another training would write its settings.
+    with folder.lock(LAUNCHER):
+        with folder.lock():
+            check_resumable(folder, resolved)
+            listening_place(config.service.bind, folder.path)
+            finished = folder.has_finished(config)
+            if not finished:
+                folder.logs.mkdir(exist_ok=True)
+                folder.write_config(resolved)
+                # Left by a master that was killed; workers must wait for the new one.
+                folder.connection.unlink(missing_ok=True)
+        return _launched(config, resolved, folder, finished)
+
+
+def _launched(
+    config: MasterConfig, resolved: Mapping[str, Any], folder: RunFolder, finished: bool
+) -> int:
     console, form = sturdy_console(sys.stderr), config.service.log_format
     code = code_of(resolved)
     launcher = Launcher(config, folder, code)

@@ -25,7 +25,7 @@ from tangram_core.store.checkpoints import list_checkpoints
 from tangram_core.store.files import PUBLIC, is_same, make_folders, private, write_whole
 
 PRIVATE = 0o600
-LOCK = ".lock"
+LOCK, LAUNCHER = ".lock", ".launcher"
 
 
 class RunFolder:
@@ -108,9 +108,13 @@ class RunFolder:
         spent = bool(name) and 0 < getattr(config, name) <= reached
         return spent and result["scored_updates"] == result["updates"]
 
-    def lock(self) -> "Claim":
-        """Claim the folder for one process, until `close` or its end; ConfigError if it is used."""
-        return Claim(self)
+    def lock(self, name: str = LOCK) -> "Claim":
+        """Claim the folder for one process, until `close` or its end; ConfigError if it is used.
+
+        Args:
+            name: `LOCK` for who writes the run, `LAUNCHER` for who starts its processes.
+        """
+        return Claim(self, name)
 
     def write_again(self) -> None:
         """Write what is missing of what was written, or read, here: the folder is a new one."""
@@ -163,9 +167,9 @@ class FolderError(RunError):
 class Claim:
     """A run folder in which no other process works, as long as it is the one that was claimed."""
 
-    def __init__(self, run: RunFolder) -> None:
+    def __init__(self, run: RunFolder, name: str = LOCK) -> None:
         """Claim a folder; ConfigError if another process works there."""
-        self.run = run
+        self.run, self._name = run, name
         self._take()
 
     def __enter__(self) -> Self:
@@ -184,7 +188,7 @@ class Claim:
             FolderError: it is gone, or another run's, or another process works there.
         """
         path = self.run.path
-        if is_same(self._lock.fileno(), path / LOCK):
+        if is_same(self._lock.fileno(), path / self._name):
             return False
         try:
             if not path.is_dir():
@@ -205,7 +209,7 @@ class Claim:
 
     def _take(self) -> None:
         # Whoever can open it can lock it.
-        lock = open(self.run.path / LOCK, "ab", opener=private)  # noqa: SIM115
+        lock = open(self.run.path / self._name, "ab", opener=private)  # noqa: SIM115
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

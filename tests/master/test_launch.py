@@ -67,6 +67,24 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
     assert not folder.config.exists()
 
 
+@pytest.mark.fast
+def test_a_training_that_begins_a_moment_later_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the master of the first has claimed the folder."""
+
+    def second(_: Launcher) -> int:
+        with pytest.raises(ConfigError, match="in use by another process"):
+            run_training(MasterConfig(str(tmp_path)), {"seed": 2})
+        return 7
+
+    monkeypatch.setattr(Launcher, "run", second)
+    assert run_training(MasterConfig(str(tmp_path)), {"seed": 1}) == 7
+    assert RunFolder(tmp_path).read_config() == {"seed": 1}
+    monkeypatch.setattr(Launcher, "run", lambda _: 0)
+    assert run_training(MasterConfig(str(tmp_path)), {"seed": 3}) == 0
+
+
 # A master of a few lines: it says where it can be reached, and ends when it is told to.
 MASTER = """
 import os, signal, sys, threading
