@@ -110,12 +110,12 @@ end_job() {
         exit 0
     fi
     if [[ -z $warned ]]; then
-        say "the run is not complete: submit the job again with RUN_DIR=$RUN_DIR to go on"
+        say "the run is not complete: submit the job again with RUN_DIR=${RUN_DIR@Q} to go on"
         exit "$status"
     fi
     say "the run is not complete: the job is queued again"
     if ! scontrol requeue "$SLURM_JOB_ID"; then
-        say "this cluster does not queue it again: submit it again with RUN_DIR=$RUN_DIR to go on"
+        say "this cluster does not queue it again: submit it again with RUN_DIR=${RUN_DIR@Q} to go on"
         exit 1
     fi
 }

@@ -9,4 +9,4 @@ source "$PROJECT/slurm/lib.sh"
 
 threads=${SLURM_CPUS_PER_TASK:-1}
 export OMP_NUM_THREADS=$threads MKL_NUM_THREADS=$threads OPENBLAS_NUM_THREADS=$threads
-become tangram-master "run_dir='$RUN_DIR'" resume=auto "service.threads=$threads" "$@"
+become tangram-master "$(setting run_dir "$RUN_DIR")" resume=auto "service.threads=$threads" "$@"

@@ -47,7 +47,7 @@ failures=0
 while true; do
     await_master
     began=$SECONDS
-    become tangram-worker "connect='$RUN_DIR'" "$@" &
+    become tangram-worker "$(setting connect "$RUN_DIR")" "$@" &
     worker=$!
     await "$worker"
     [[ -z $leaving ]] || exit 0

@@ -17,6 +17,7 @@ from tangram_agent.runs import Run, load_changed
 from tangram_core import scores
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
+from tangram_core.run.code import argument
 from tangram_core.run.outcome import plural
 from tangram_core.store.files import write_whole
 from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names
@@ -92,7 +93,7 @@ def _shown(run: Run, config: PlayConfig) -> str:
     if film is None and not frames:
         raise ConfigError(
             f"{run.folder} plays task={run.setup.task_kind}, which draws no pictures: "
-            f"tangram-eval run_dir={run.folder} scores it"
+            f"tangram-eval {argument('run_dir', run.folder)} scores it"
         )
     save_picture(config.out, [Image.fromarray(one) for one in film or frames])
     return line

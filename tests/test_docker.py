@@ -2,6 +2,7 @@
 
 import ast
 import re
+import shlex
 import sys
 import tomllib
 from functools import cache
@@ -123,8 +124,9 @@ def test_nothing_runs_as_root() -> None:
 @pytest.mark.parametrize("service", ["master", "master-gpu", "worker", "evaluator"])
 def test_commands_of_the_compose_file_are_settings_that_exist(service: str) -> None:
     primary = "master" if service.startswith("master") else "worker"
-    overrides = filled(COMPOSE["services"][service]["command"]).split()
-    composed(primary, overrides)
+    command = COMPOSE["services"][service]["command"].replace("${RUN:-run}", "lr=1e-3 ü")
+    config = composed(primary, shlex.split(filled(command)))
+    assert "/runs/lr=1e-3 ü" in (config.get("run_dir"), config.get("connect"))
 
 
 def test_the_command_of_the_master_image_exists() -> None:

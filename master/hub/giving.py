@@ -22,6 +22,7 @@ from master.hub.security import (
 from master.record.audit import write_line
 from master.record.rundir import RunFolder
 from tangram_core.errors import UNREADABLE, ConfigError, RunError
+from tangram_core.run.code import argument
 from tangram_core.store.files import private, write_whole
 from tangram_core.wire.messages import ROLES
 
@@ -95,7 +96,7 @@ def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[s
     write_whole(out, json.dumps(mine, indent=1).encode(), PRIVATE)
     write_keys(folder.keys, replace(keys, given=given))
     write_line(folder.audit, "key added", key=name, role=config.role)
-    line = f"tangram-worker connect={out.name} role={config.role}"
+    line = f"tangram-worker {argument('connect', out.name)} role={config.role}"
     told = [f"{out} lets {name} take part as {config.role} ({line}): hand it on by a private way"]
     if connection.get("settings", {}).get("service", {}).get("port") == 0:
         told.append(STALE)

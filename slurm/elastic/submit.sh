@@ -28,4 +28,4 @@ code_of "$@"
 workers=$(sbatch --parsable --dependency="after:$master" --array="0-$WORKERS" \
     "${worker_options[@]}" "$PROJECT/slurm/elastic/workers.sbatch" "${code[@]}")
 echo "master: job $master, evaluator and workers: job $workers, run folder: $RUN_DIR"
-echo "see how it stands with: tangram-status connect=$RUN_DIR"
+printf 'see how it stands with: tangram-status %q\n' "$(setting connect "$RUN_DIR")"

@@ -20,7 +20,8 @@ from tangram_core.errors import ConfigError
 IMPORTS = "imports"  # setting of any section: modules to import
 KIND = "kind"  # setting of a section that names what it is of: task.kind is given as task
 KNOWN = ("gymnasium_robotics", "panda_gym")  # modules of the extra `robotics`
-PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
+_ESCAPED = re.compile(r"(\\*)('|\$\{|$)")
+PLAIN = re.compile(r"[\w.]+=[\w./:-]+", re.ASCII)
 
 _named = set[str]()  # modules
 _files = set[Path]()  # that were loaded
@@ -40,8 +41,12 @@ def override(name: str, value: str) -> str:
     """A setting whose value may hold anything, such as a path with blanks or `=`, for hydra."""
     if names_modules(name):  # a list, and it stays one
         return f"{name}={value}"
-    escaped = value.replace("'", "\\'")
-    return f"{name}='{escaped}'"
+    # Backslashes escape only a quote and ${, which would be looked up.
+    return f"{name}='{re.sub(_ESCAPED, _escaped, value)}'"
+
+
+def _escaped(found: re.Match[str]) -> str:
+    return found[1] * 2 + (found[2] and f"\\{found[2]}")
 
 
 def argument(name: str, value: object) -> str:

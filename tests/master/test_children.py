@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import time
 from pathlib import Path
@@ -13,11 +14,12 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
 from master import children as children_module
 from master.children import MAX_RESTARTS, Child, describe
 from master.forking import environment
-from tangram_core.run.code import override
+from tangram_core.run.code import argument, override
 from tests.bodies import run_code
 
 LIMIT_S = 100.0
@@ -42,11 +44,23 @@ def test_statuses_in_words(status: int, words: str) -> None:
     assert describe(status) == words
 
 
+TEXTS = st.text(st.characters(blacklist_categories=["Cs", "Cc"]) | st.sampled_from("\\'${}"))
+
+
 @pytest.mark.fast
-@given(st.text(st.characters(blacklist_categories=["Cs", "Cc"], blacklist_characters="\\$")))
+@given(TEXTS)
 def test_any_path_is_read_back_from_an_override(value: str) -> None:
     (parsed,) = OverridesParser.create().parse_overrides([override("run_dir", value)])
-    assert (parsed.key_or_group, parsed.value()) == ("run_dir", value)
+    assert parsed.key_or_group == "run_dir"
+    assert OmegaConf.create({"it": parsed.value()}).it == value
+
+
+@pytest.mark.fast
+@given(TEXTS)
+def test_any_path_is_read_back_from_what_is_pasted(value: str) -> None:
+    (word,) = shlex.split(argument("run_dir", f"runs/{value}"))
+    (parsed,) = OverridesParser.create().parse_overrides([word])
+    assert OmegaConf.create({"it": parsed.value()}).it == f"runs/{value}"
 
 
 # (how long it lived, how long it was stopped, its status, restarts in a row or None to give up)

@@ -9,6 +9,7 @@ import pytest
 
 from conf.cli import composed
 from conf.own import with_named_code
+from tangram_core.run.code import override
 
 pytestmark = pytest.mark.fast
 
@@ -33,6 +34,7 @@ def identity(path: Path) -> str:
 def settings(path: Path) -> Iterator[list[tuple[str, str]]]:
     """What each line of a script or of an example in it sets: a command's config, and the word."""
     text = path.read_text().replace("\\\n", " ")
+    text = re.sub(r'"?\$\(setting (\w+) "([^"]*)"\)"?', r"\1=\2", text)
     for line in text.splitlines():
         taker = TAKERS.search(line)
         if taker is None:
@@ -64,6 +66,13 @@ def test_workers_are_told_of_code_and_of_nothing_else() -> None:
     command = ["bash", "-euc", script, str(FOLDER / "code.sh"), *plain, *code]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     assert told.splitlines() == code
+
+
+@pytest.mark.parametrize("value", ["runs/x", "O'Brien", "a\\", "a\\'b\\\\", "${a}", "ä = $1 \\${"])
+def test_a_setting_holds_any_value(value: str) -> None:
+    command = ["bash", "-euc", 'source "$0"; setting run_dir "$1"', str(FOLDER / "code.sh"), value]
+    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert told == override("run_dir", value)
 
 
 def test_settings_are_found() -> None:
