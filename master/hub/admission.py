@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from master.hub.gate import Room
-from master.hub.registry import Peer, RefusedError, Registry
+from master.hub.registry import ANOTHER_KEY, Peer, RefusedError, Registry
 from master.hub.security import Holder
 from master.hub.sockets import Sockets
 from master.record.audit import Audit
@@ -66,7 +66,7 @@ class Admission:
         """Welcome a process, or tell it why it may not take part; returns who may."""
         try:
             self._check(hello, caller)
-            peer, older = self.registry.admit(identity, hello, now)
+            peer, older = self.registry.admit(identity, hello, now, caller.name)
         except RefusedError as error:
             who = {"role": hello.role, "index": hello.index, "process": hello.process}
             where = {"key": caller.name, "address": address, "reason": error.answer.reason}
@@ -126,10 +126,7 @@ class Admission:
             its = peer.process == hello.process or peer.key == (hello.role, hello.index)
             # What the run starts itself has its place: a key that was given away gets another.
             if its and peer.holder != caller.name and caller.name not in ROLES:
-                reason = (
-                    f"{peer.name} takes part with another key: leave index out, or choose another"
-                )
-                raise RefusedError("refused_keys", Refused(reason))
+                raise RefusedError("refused_keys", Refused(f"{peer.name} {ANOTHER_KEY}"))
 
     def _tell_losses(self, peer: Peer) -> None:
         lost = self.registry.lost_batches - self._counters["lost_batches"]

@@ -203,8 +203,8 @@ class Hub:
     def recover(self, arrival: EpisodesArrived) -> bool:
         """Note a batch of the journal, before the first poll; False if it was inserted before."""
         key = (arrival.role, arrival.index)
-        sent = (arrival.incarnation, arrival.sequence)
-        return self._registry.recover(key, *sent, time.monotonic(), arrival.process)
+        sent, by = (arrival.incarnation, arrival.sequence), (arrival.process, arrival.owner)
+        return self._registry.recover(key, *sent, time.monotonic(), *by)
 
     def close(self) -> None:
         """Close the sockets; answers that are on their way get a second."""
@@ -329,7 +329,8 @@ class Hub:
         self.counters["episodes"] += batch.episodes.count
         self._orders.pop(peer.index, None)
         self._waiting.add(peer.key)
-        return EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames, peer.process)
+        who = (peer.role, peer.index, peer.incarnation)
+        return EpisodesArrived(*who, batch, frames, peer.process, peer.ledger.owner)
 
     def _is_ordered(self, peer: Peer, batch: EpisodeBatch) -> bool:
         """Whether a new batch is what the player was told to play; else it is told again."""

@@ -3,7 +3,8 @@
 Each role counts its own indices. A new process of an index gets the next incarnation and wins over
 the older one; a process that comes back after the master was restarted keeps what it had, unless
 the master has lost it (a disk without power): then it gets the next one, too. No process names one
-that was never given.
+that was never given. An index stays with the key that had it first: no other key goes on with its
+batches, or begins anew there.
 """
 
 import logging
@@ -21,6 +22,7 @@ CROWDED = 0.9  # share of the room from which on there is a warning
 WEIGHTS_AGAIN_S = 10.0
 # Answers about the run: so many in this time over all who ask, and one for each connection.
 STATUS_ANSWERS, STATUS_AGAIN_S = 64, 0.5
+ANOTHER_KEY = "takes part with another key: leave index out, or choose another"
 Key = tuple[str, int]
 
 log = logging.getLogger(__name__)
@@ -143,15 +145,23 @@ class Registry:
         ledger = self._ledgers.get(key)
         return ledger if ledger is not None and ledger.incarnation == incarnation else None
 
-    def admit(self, identity: bytes, hello: Hello, now: float) -> tuple[Peer, Peer | None]:
+    def admit(
+        self, identity: bytes, hello: Hello, now: float, owner: str = ""
+    ) -> tuple[Peer, Peer | None]:
         """Take a process in: the newest of an index wins.
+
+        Args:
+            identity: its connection.
+            hello: what it says.
+            now: monotonic seconds.
+            owner: name of its key.
 
         Returns:
             The peer, and the older process that it took the index from.
 
         Raises:
             RefusedError: other settings, too many peers, or an index that belongs to a newer
-                incarnation.
+                incarnation, or to another key.
         """
         self._check_settings(hello)
         same = next((p for p in self._by_key.values() if p.process == hello.process), None)
@@ -167,9 +177,13 @@ class Registry:
         stranger = self._by_identity.get(identity)
         if stranger is not None:
             self.leave(stranger)
-        index = hello.index if hello.index >= 0 else self._free_index(hello.role, now)
+        index = hello.index if hello.index >= 0 else self._free_index(hello.role, now, owner)
         key = (hello.role, index)
-        ledger = self._open_ledger(key, hello)
+        # What the run starts itself has its place: a key that was given away gets another.
+        if key in self._ledgers and not self._ledgers[key].is_of(owner) and owner not in ROLES:
+            reason = f"{hello.role} {index} {ANOTHER_KEY}"
+            raise RefusedError("refused_keys", Refused(reason))
+        ledger = self._open_ledger(key, hello, owner)
         older = self._by_key.get(key)
         if older is not None:
             self.leave(older)
@@ -199,6 +213,7 @@ class Registry:
                 "incarnation": ledger.incarnation,
                 "sequence": ledger.inserted,
                 **({"process": ledger.process} if ledger.process else {}),
+                **({"owner": ledger.owner} if ledger.owner else {}),
             }
             for (role, index), ledger in sorted(self._ledgers.items())
         }
@@ -209,12 +224,18 @@ class Registry:
         self._reserved_until = now + self._grace_s
 
     def recover(
-        self, key: Key, incarnation: int, sequence: int, now: float, process: str = ""
+        self,
+        key: Key,
+        incarnation: int,
+        sequence: int,
+        now: float,
+        process: str = "",
+        owner: str = "",
     ) -> bool:
         """Note a batch of the journal as inserted; False if the table has it already."""
         ledger = self._ledgers.get(key)
         if ledger is None or incarnation > ledger.incarnation:
-            ledger = self._ledgers[key] = Ledger(incarnation, process=process)
+            ledger = self._ledgers[key] = Ledger(incarnation, process=process, owner=owner)
         known = self._recovered.get((key, incarnation), 0)
         # A process that was taken over may have had a batch here that was not inserted yet, so that
         # the checkpoint has it not: what is read here was journalled after it.
@@ -252,15 +273,17 @@ class Registry:
         )
         raise RefusedError("refused_settings", Refused(reason))
 
-    def _free_index(self, role: str, now: float) -> int:
+    def _free_index(self, role: str, now: float, owner: str) -> int:
         reserved = self._ledgers if now < self._reserved_until else {}
         for index in range(MAX_INDEX + 1):
-            if (role, index) not in self._by_key and (role, index) not in reserved:
+            key = (role, index)
+            own = key not in self._ledgers or self._ledgers[key].is_of(owner)
+            if own and key not in self._by_key and key not in reserved:
                 return index
         reason = f"all {MAX_INDEX + 1} indices of role {role} are taken"
         raise RefusedError("refused_full", Refused(reason))
 
-    def _open_ledger(self, key: Key, hello: Hello) -> Ledger:
+    def _open_ledger(self, key: Key, hello: Hello, owner: str) -> Ledger:
         last = self._ledgers.get(key)
         known = 0 if last is None else last.incarnation
         if last is None or hello.incarnation == 0 or hello.incarnation > known:
@@ -279,7 +302,7 @@ class Registry:
             ledger = last
             # Acknowledged after the checkpoint was written, so the worker has them no more.
             self.lost_batches += ledger.skip_to(hello.first)
-        ledger.process = hello.process
+        ledger.process, ledger.owner = hello.process, owner
         self._ledgers[key] = ledger
         return ledger
 
@@ -316,6 +339,8 @@ def _ledger(name: str, entry: object) -> Ledger:
                 f"the checkpoint's entry of {name} must hold an incarnation from 1 and a sequence "
                 f"from 0, both to {MAX_COUNT}, got {entry!r}"
             )
-    process = found.get("process")
-    known = process if isinstance(process, str) and len(process) <= MAX_ID else ""
-    return Ledger(int(incarnation or 0), int(sequence or 0), known)
+    process, owner = (
+        one if isinstance(one, str) and len(one) <= MAX_ID else ""
+        for one in (found.get("process"), found.get("owner"))
+    )
+    return Ledger(int(incarnation or 0), int(sequence or 0), process, owner)

@@ -37,6 +37,7 @@ class EpisodesArrived:
     batch: EpisodeBatch
     frames: Sequence[bytes]
     process: str = ""
+    owner: str = ""
 
     @property
     def sequence(self) -> int:
@@ -89,6 +90,7 @@ class Ledger:
         received: number of the last batch that was taken or finally refused.
         process: random id of the process, empty where it is not known. Two may name one
             incarnation: what was given before a kill and had no batch is given again after it.
+        owner: name of the key that opened it, and whose it stays; empty where there are none.
         held: taken, not inserted yet.
         unused: no batch of this index was ever taken, in this incarnation or before.
     """
@@ -96,8 +98,13 @@ class Ledger:
     incarnation: int
     received: int = 0
     process: str = ""
+    owner: str = ""
     held: set[int] = field(default_factory=set)
     unused: bool = False
+
+    def is_of(self, owner: str) -> bool:
+        """Whether it is a key's own, or there are no keys."""
+        return not self.owner or owner in ("", self.owner)
 
     @property
     def inserted(self) -> int:

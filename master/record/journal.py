@@ -38,7 +38,7 @@ from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
 from tangram_core.wire.schema import MAX_COUNT, Message
 
-FORMAT = 4
+FORMAT = 5  # 4 had no owners
 SUFFIX = ".log"
 DIGITS = 8
 MAGIC = b"\xf1TJ\n"
@@ -79,6 +79,7 @@ class Entry(Message):
     index: Index
     incarnation: Number
     process: Id
+    owner: Id
 
 
 class JournalError(RunError):
@@ -128,7 +129,8 @@ class Journal:
             JournalError: the disk is full or broken. What was written of it is taken back; where
                 it may have been written after all, a restart drops what it has twice.
         """
-        entry = Entry(arrival.role, arrival.index, arrival.incarnation, arrival.process)
+        who = (arrival.role, arrival.index, arrival.incarnation)
+        entry = Entry(*who, arrival.process, arrival.owner)
         file = self._file or self._begin()
         self._write(file, _record(entry, self.number + 1, arrival.frames))
         self.number += 1

@@ -286,7 +286,7 @@ def _title(path: Path, found: _Found) -> Title | None:
         ) from None
     if header["kind"] != Title.kind:
         return None
-    if header.get("format") != FORMAT:
+    if header.get("format") not in (FORMAT - 1, FORMAT):
         raise RunError(f"{path} is no segment of format {FORMAT}: {ANOTHER}")
     return read(Title, header)
 
@@ -294,11 +294,12 @@ def _title(path: Path, found: _Found) -> Title | None:
 def _batch(body: bytes, spec: EpisodeSpec) -> EpisodesArrived:
     """The batch that a whole record holds, checked as when it came; WireError if it is none."""
     header, data = _parts(body)
-    entry, frames = read(Entry, header), split_frames(data)
+    entry, frames = read(Entry, {"owner": "", **header}), split_frames(data)
     batch = decode_from_worker(frames, spec)
     if not isinstance(batch, EpisodeBatch):
         raise WireError(f"a message of kind {batch.kind!r}")
-    return EpisodesArrived(entry.role, entry.index, entry.incarnation, batch, frames, entry.process)
+    who = (entry.role, entry.index, entry.incarnation)
+    return EpisodesArrived(*who, batch, frames, entry.process, entry.owner)
 
 
 def _parts(body: bytes) -> tuple[Mapping[str, Any], bytes]:

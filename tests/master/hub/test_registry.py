@@ -233,3 +233,33 @@ def test_after_a_restart_an_incarnation_belongs_to_the_process_that_used_it(
         admitted(registry, "first", index=0, incarnation=1)
     again = admitted(registry, "second", index=0, incarnation=1)
     assert (again.incarnation, again.ledger.inserted) == (1, 1)
+
+
+@pytest.mark.parametrize("kept", ["in the journal", "in a checkpoint", "live"])
+def test_an_index_stays_with_the_key_that_had_it_first(registry: Registry, kept: str) -> None:
+    """Process, index and incarnation can be read in the run's folder; they prove nothing."""
+    entry = {"incarnation": 1, "sequence": 1, "process": "hers", "owner": "alice"}
+    if kept == "in the journal":
+        registry.recover(("player", 0), 1, 1, 0.0, "hers", "alice")
+    elif kept == "in a checkpoint":
+        registry.load_state({"player/0": entry}, 0.0)
+    else:
+        registry.admit(b"hers", hello(process="hers"), 0.0, "alice")[0].ledger.take(1, WINDOW)
+        registry.peers[0].ledger.release(1)
+        registry.leave(registry.peers[0])
+    assert registry.state() == {"player/0": entry}
+    stolen = {"index": 0, "incarnation": 1, "process": "hers", "first": 1000}
+    for claim in (stolen, stolen | {"incarnation": 9}, {"index": 0, "process": "mine"}):
+        with pytest.raises(RefusedError, match="player 0 .* another key: leave index out"):
+            registry.admit(b"mallory", hello(**claim), 1.0, "mallory")
+    later = 2.0 * GRACE_S
+    for owner in ("mallory", "player"):  # the lowest that is free is none of hers
+        peer, _ = registry.admit(owner.encode(), hello(process=owner), later, owner)
+        assert peer.index > 0
+    again, _ = registry.admit(
+        b"back", hello(process="hers", index=0, incarnation=1, first=2), later, "alice"
+    )
+    assert (again.incarnation, again.ledger.inserted, registry.lost_batches) == (1, 1, 0)
+    # The run's own workers have their places.
+    own, older = registry.admit(b"own", hello(process="own", index=0), later, "player")
+    assert (own.incarnation, older) == (2, again)

@@ -4,6 +4,7 @@ import errno
 import os
 import tracemalloc
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ def sequences(folder: Path, **more: Any) -> list[int]:
 
 
 def assert_same(one: EpisodesArrived, other: EpisodesArrived) -> None:
-    for name in ("role", "index", "incarnation", "sequence", "weights_version"):
+    for name in ("role", "index", "incarnation", "process", "owner", "sequence", "weights_version"):
         assert getattr(one, name) == getattr(other, name), name
     for name, ours in one.episodes.arrays.items():
         theirs = other.episodes[name]
@@ -64,6 +65,7 @@ def assert_same(one: EpisodesArrived, other: EpisodesArrived) -> None:
 def test_batches_come_back_as_they_were_appended(tmp_path: Path, made: Setup) -> None:
     written = [arrival(made, number, count=number, version=number - 2) for number in (1, 2, 3)]
     kept = journal(tmp_path, made)
+    written[1] = replace(written[1], process="hers", owner="alice")
     for one in written:
         kept.append(one)  # not closed: as a kill leaves it
     for one, other in zip(written, read(tmp_path, made=made), strict=True):
@@ -405,8 +407,17 @@ def test_one_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
         journal_run_id(tmp_path)
     [later] = Title(FORMAT + 1, "run", MADE.task_digest()).encode()
     path.write_bytes(record(later))
-    with pytest.raises(RunError, match=r"is no segment of format 4: choose another run_dir"):
+    with pytest.raises(RunError, match=r"is no segment of format 5: choose another run_dir"):
         read(tmp_path)
+
+
+def test_one_from_before_keys_owned_what_they_sent_is_read(tmp_path: Path) -> None:
+    one, [title] = arrival(MADE, 1), Title(4, "run", MADE.task_digest()).encode()
+    [entry] = seal("batch", {"role": "player", "index": 0, "incarnation": 1, "process": "p"}, [])
+    data = record(title) + record(entry, join_frames(one.frames), 1)
+    (tmp_path / "00000001.log").write_bytes(data)
+    journal(tmp_path, MADE, number=1).append(arrival(MADE, 2))
+    assert [(found.process, found.owner) for found in read(tmp_path)] == [("p", ""), ("", "")]
 
 
 FORGED: dict[str, tuple[dict[str, Any], str]] = {
@@ -441,7 +452,8 @@ def test_a_forged_record_is_left_out_and_no_reason_to_throw_the_others_away(
         frames = seal(header["kind"], fields | change, frames[1:])
     if "damage" in change:
         frames[-1] = bytes([frames[-1][0] ^ 1]) + frames[-1][1:]
-    entry = {"kind": "batch", "role": "player", "index": 0, "incarnation": 1, "process": "p"} | {
+    entry = {"kind": "batch", "role": "player", "index": 0, "incarnation": 1, "process": "p"}
+    entry |= {"owner": ""} | {
         n: v for n, v in change.items() if n in ("kind", "role", "index", "incarnation")
     }
     [packed] = seal(str(entry.pop("kind")), entry, [])
