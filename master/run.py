@@ -164,7 +164,7 @@ def open_run(
     elif config.resume == "auto":
         log.info("a new run begins")
     checkpointer = Checkpointer(service, claim, guard, hub, journal, clock)
-    metrics = Metrics(folder.tensorboard, folder.curve, trainer.updates)
+    metrics = Metrics(folder.tensorboard, folder.curve, trainer.updates, rest.record.loop_s)
     opened.enter_context(closing(metrics))
     status = StatusCollector(folder.path.name, guard, hub, budget, clock, checkpointer)
     listeners = [hub.tell, *([] if health is None else [health.update])]

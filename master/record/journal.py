@@ -18,6 +18,7 @@ A record goes to the operating system at once, so that it outlives the process; 
 disk at an interval, so a machine that loses power may lose what came since.
 """
 
+import logging
 import os
 import struct
 import zlib
@@ -80,6 +81,9 @@ class Entry(Message):
     incarnation: Number
     process: Id
     owner: Id
+
+
+log = logging.getLogger(__name__)
 
 
 class JournalError(RunError):
@@ -178,13 +182,13 @@ class Journal:
         return Place(self.segment, self.number)
 
     def drop_before(self, segment: int) -> None:
-        """Delete the segments below a number, which checkpoints cover; JournalError if it fails."""
-        try:
-            for number, path in segments(self._folder).items():
+        """Delete the segments below a number, which checkpoints cover; it is told if that fails."""
+        for number, path in segments(self._folder).items():
+            try:
                 if number < min(segment, self.segment):
                     path.unlink(missing_ok=True)
-        except OSError as error:
-            raise self._broken(error) from None
+            except OSError as error:
+                log.warning("%s cannot be deleted (%s): delete it yourself", path, error.strerror)
 
     def close(self) -> None:
         """Sync, and close the file."""

@@ -1,18 +1,18 @@
 """The curves of a run: TensorBoard, what is written, under which name, against what.
 
-Curves are drawn against updates. Scores of the evaluator stand there three times: against updates
-(`test`), against episodes (`test_by_episodes`) and against seconds of training (`test_by_seconds`).
-All of it is one run in TensorBoard's list; docs/tensorboard.md explains every tag. For plots
-without TensorBoard `curve.jsonl` has every evaluation, one JSON object a line.
+Curves are drawn against updates. All of it is one run in TensorBoard's list; docs/tensorboard.md
+explains every tag. For plots without TensorBoard, or against episodes or seconds, `curve.jsonl` has
+the evaluations, one JSON object a line.
 """
 
 import json
 import logging
+import math
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from tangram_core.arrays import Pixels
+from tangram_core.errors import RunError
 from tangram_core.run.process import Every
 from tangram_core.scores import SHOWN, read
 from tangram_core.store.files import make_folders, write_whole
@@ -29,6 +30,7 @@ from tangram_core.store.files import make_folders, write_whole
 FLUSH_S = 30
 RETRY_S = 60.0
 POINT = ("updates", "episodes", "train_s")  # where an evaluation stands
+POINTS = 2000  # of a curve; with each factor of e in the run's age as many more
 HPARAMS = ("seed", "updates", "episodes", "workers", "train_s")  # beside what tells task and agent
 
 log = logging.getLogger(__name__)
@@ -55,30 +57,40 @@ class Means:
         return means
 
 
+class Thinning:
+    """Lets points of a curve through, ever fewer: a run of a year must not fill the disk."""
+
+    def __init__(self, age_s: float, points: int = POINTS) -> None:
+        """Begin with a run that is so old."""
+        self._points, self._begun_s, self._last_s = points, time.monotonic() - age_s, -math.inf
+
+    def due(self) -> bool:
+        """Whether there is a point now."""
+        now_s = time.monotonic()
+        if now_s - self._last_s < (now_s - self._begun_s) / self._points:
+            return False
+        self._last_s = now_s
+        return True
+
+
 class Metrics:
     """Writes the curves of one run: to TensorBoard, and evaluations to curve.jsonl, too.
 
     What the disk does not take is left out, and told: curves are not worth a run. Points of an
     earlier process after the checkpoint that the run goes on from, with so many updates, are hidden
-    or dropped, since they happen again.
+    or dropped, since they happen again. What lies in their place and is none is set aside.
     """
 
-    def __init__(self, folder: Path, curve: Path, updates: int = 0) -> None:
-        self._folder, self._curve = folder, curve
+    def __init__(self, folder: Path, curve: Path, updates: int = 0, age_s: float = 0.0) -> None:
+        self._folder, self._curve, self._evaluated = folder, curve, Thinning(age_s)
         self._hook, threading.excepthook = threading.excepthook, self._thread_failed
-        kept = [line for line in _lines(curve) if line["updates"] <= updates]
+        if folder.exists() and not folder.is_dir():
+            _set_aside(folder)
         if curve.exists():
-            write_whole(curve, "".join(map(_text, kept)).encode(), above=False)
+            self._keep(updates)
         self._broken = False
         self._again = Every(RETRY_S)
-        purge = updates + 1 if updates else None
-        self._open(purge)
-        # TensorBoard hides the points of every tag from that step on, and does not know that the
-        # steps of some are episodes or seconds: those that stay are written again.
-        for line in kept if purge else ():
-            scores = {name: value for name, value in line.items() if name not in POINT}
-            point = (line["episodes"], line["train_s"], updates + 1)
-            self._try(partial(self._by_others, scores, *point))
+        self._open(updates + 1 if updates else None)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Points of many curves at one step."""
@@ -93,8 +105,9 @@ class Metrics:
         self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float
     ) -> None:
         """An evaluation of the weights after so many updates, episodes, seconds of training."""
+        if not self._evaluated.due():
+            return
         self.scalars({f"test/{name}": value for name, value in scores.items()}, updates)
-        self._try(lambda: self._by_others(scores, episodes, seconds))
         line = {"updates": updates, "episodes": episodes, "train_s": round(seconds, 3), **scores}
         try:
             with self._curve.open("a", encoding="utf-8") as file:
@@ -147,13 +160,16 @@ class Metrics:
         make_folders(self._folder, above=False)  # a run folder that was deleted stays so
         self._writer = SummaryWriter(str(self._folder), purge_step=purge, flush_secs=FLUSH_S)
 
-    def _by_others(
-        self, scores: Mapping[str, float], episodes: int, seconds: float, least: int = 0
-    ) -> None:
-        """An evaluation against episodes and seconds, where they are `least` or more."""
-        for group, step in (("test_by_episodes", episodes), ("test_by_seconds", seconds)):
-            for name, value in scores.items() if int(step) >= least else ():
-                self._writer.add_scalar(f"{group}/{name}", value, int(step))
+    def _keep(self, updates: int) -> None:
+        """Drop evaluations that happen again, and what is none."""
+        try:
+            before = self._curve.read_bytes()
+            kept = [line for line in _lines(before) if line["updates"] <= updates]
+            after = "".join(map(_text, kept)).encode()
+            if after != before:
+                write_whole(self._curve, after, above=False)
+        except (OSError, RunError):
+            _set_aside(self._curve)
 
     def _try(self, write: Callable[[], object]) -> None:
         """Write, unless the disk did not take anything a short while ago."""
@@ -181,10 +197,19 @@ def _text(line: Mapping[str, Any]) -> str:
     return json.dumps(line) + "\n"
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
-    """What an earlier process wrote; a line that was cut short is left out."""
+def _set_aside(path: Path) -> None:
+    """Give another name to what is in the way; if that fails, too, curves have a gap."""
+    try:
+        aside = path.rename(path.with_name(f"{path.name}.{time.time():.0f}.aside"))
+        log.warning("%s was no curve that can be gone on with: it is %s now", path, aside.name)
+    except OSError as error:
+        log.warning("%s is in the way of curves (%s)", path, error.strerror)
+
+
+def _lines(data: bytes) -> list[dict[str, Any]]:
+    """What an earlier process wrote; a line that was cut short or damaged is left out."""
     found = []
-    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for text in data.splitlines():
         try:
             line = json.loads(text)
         except (ValueError, RecursionError):

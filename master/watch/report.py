@@ -22,7 +22,7 @@ from master.learn.trainer import Trainer
 from master.record.delivery import REMEMBERED_VERSIONS, EpisodesArrived
 from master.record.rundir import Clock, Record
 from master.watch.console import PLAYED, TEST, Progress
-from master.watch.metrics import Means, Metrics
+from master.watch.metrics import Means, Metrics, Thinning
 from tangram_core.arrays import Floats
 from tangram_core.errors import RunError
 from tangram_core.run.process import Every
@@ -32,6 +32,7 @@ from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus, Scores
 
 UNKNOWN = -1.0
 PICTURE_S = 30.0
+PICTURES = 100  # in TensorBoard, as POINTS
 TICK_S = 0.1
 LISTEN_S = 1.0
 LOG_S = 2.0  # between two lines of progress, and of the curves
@@ -199,6 +200,7 @@ class Reporter:
         self._losses, self._play = Means(), Means()
         self._tick, self._listen = Every(TICK_S, at_once=True), Every(LISTEN_S, at_once=True)
         self._log, self._picture = Every(LOG_S), Every(PICTURE_S, at_once=True)
+        self._point, self._shown = Thinning(record.loop_s), Thinning(record.loop_s, PICTURES)
         self._path = picture
         self._published: OrderedDict[int, Sent] = OrderedDict()
         self._latest: Scores | None = None
@@ -235,8 +237,9 @@ class Reporter:
         self.metrics.scores(values, updates, sent.episodes, sent.train_s)
         # Writing it takes time from learning.
         if len(scores.picture) and self._picture.due():
-            half = Image.fromarray(scores.picture).reduce(2)
-            self.metrics.picture(np.asarray(half), updates)
+            if self._shown.due():
+                half = Image.fromarray(scores.picture).reduce(2)
+                self.metrics.picture(np.asarray(half), updates)
             with suppress(RunError):  # a disk that fails is told where the run needs it
                 self.draw()
 
@@ -264,6 +267,8 @@ class Reporter:
         self._progress.show(status)
         for listen in self._listeners:
             listen(status)
+        if not self._point.due():
+            return status
         values = {f"train/{name}": value for name, value in self._losses.take().items()}
         values |= played
         for name, value in status.numbers.items():

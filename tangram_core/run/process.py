@@ -113,6 +113,15 @@ WATCHDOG_S = 300.0  # without progress: longer than a large checkpoint on a slow
 PATIENT_S = 3600.0  # where a compiler runs: minutes for a large update on a busy machine
 
 
+_watching: list["Watchdog"] = []
+
+
+def still_alive() -> None:
+    """Tell the process's watchdog, if it has one, of progress: a disk may be slow for long."""
+    for one in _watching:
+        one.progress()
+
+
 class Watchdog:
     """Ends a process that lives but makes no progress, with the stacks of all threads on stderr.
 
@@ -126,9 +135,11 @@ class Watchdog:
 
     def __enter__(self) -> Self:
         self._wind()
+        _watching.append(self)
         return self
 
     def __exit__(self, *_: object) -> None:
+        _watching.remove(self)
         if self._seconds:
             faulthandler.cancel_dump_traceback_later()
 

@@ -9,10 +9,11 @@ the checksums in the manifest.
 
 import hashlib
 import json
+import logging
 import os
 import re
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
@@ -23,6 +24,7 @@ import numpy.typing as npt
 import safetensors.numpy
 
 from tangram_core.errors import RunError, WireError
+from tangram_core.run.process import still_alive
 from tangram_core.store.files import make_folders, sync_folder
 from tangram_core.wire.arrays import load_tensors
 
@@ -34,6 +36,9 @@ SETUP = "setup"  # the counter that tells the setup
 _NAME = re.compile(r"(\d{8,})(?:-(\d+))?")
 _TEMPORARY = ".writing-"
 _SET_ASIDE = ".corrupt"
+_PART = 1 << 24  # bytes after which it is told that the process lives
+
+log = logging.getLogger(__name__)
 
 Tensors = dict[str, npt.NDArray[Any]]
 
@@ -93,23 +98,30 @@ def save_checkpoint(
     aside = folder / f"{_TEMPORARY}{updates:08d}"
     try:
         make_folders(folder, above=False)
-        for left in folder.glob(f"{_TEMPORARY}*"):
-            shutil.rmtree(left)
+        _delete(folder.glob(f"{_TEMPORARY}*"))
         aside.mkdir()
         _write_content(aside, updates, arrays, counters)
         final = _free_name(folder, updates)
         # From here on it counts; a crash before leaves the older ones as they are.
         aside.rename(final)
         sync_folder(folder)
-        for old in list_checkpoints(folder)[:-keep]:
-            shutil.rmtree(old)
     except OSError as error:
         shutil.rmtree(aside, ignore_errors=True)  # others may need the room
         raise DiskError(
             f"cannot write a checkpoint to {folder} ({error}): make room there or choose another "
             "run_dir"
         ) from None
+    _delete(list_checkpoints(folder)[:-keep])
     return final
+
+
+def _delete(folders: Iterable[Path]) -> None:
+    """What nobody needs any more; if it cannot be deleted, that is told and no harm."""
+    for folder in folders:
+        try:
+            shutil.rmtree(folder)
+        except OSError as error:
+            log.warning("%s cannot be deleted (%s): delete it yourself", folder, error.strerror)
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
@@ -192,9 +204,20 @@ def _write_content(
 
 def _write(path: Path, data: bytes) -> None:
     with path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+        for start in range(0, len(data), _PART):
+            file.write(memoryview(data)[start : start + _PART])
+            file.flush()
+            os.fsync(file.fileno())
+            still_alive()
+
+
+def _content(path: Path) -> bytes:
+    parts = []
+    with path.open("rb") as file:
+        while part := file.read(_PART):
+            parts.append(part)
+            still_alive()
+    return b"".join(parts)
 
 
 def _digest(body: Mapping[str, Any]) -> str:
@@ -234,7 +257,7 @@ def _read_tensors(path: Path, stem: str, files: Mapping[str, str]) -> Tensors:
     if stem not in files:
         raise RunError(f"checkpoint {path} has no {name}: it was written by another kind of run")
     try:
-        data = (path / name).read_bytes()
+        data = _content(path / name)
     except FileNotFoundError:
         raise CorruptError(path, f"{name} is missing") from None
     except OSError as error:

@@ -1,7 +1,9 @@
 """Checkpoint folders: written whole or not at all, and every changed byte is found."""
 
+import errno
 import hashlib
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +11,8 @@ import numpy as np
 import pytest
 
 from tangram_core.errors import RunError
+from tangram_core.run.process import Watchdog
+from tangram_core.store import checkpoints
 from tangram_core.store.checkpoints import (
     CorruptError,
     list_checkpoints,
@@ -101,6 +105,40 @@ def test_a_crash_before_the_rename_leaves_the_old_one_valid(
     assert load_checkpoint(old).updates == 5
     save(tmp_path, updates=6)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00000005", "00000006"]
+
+
+def test_an_old_one_that_cannot_be_deleted_is_told_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    save(tmp_path, updates=5)
+
+    def fail(path: Path) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", fail)
+        save(tmp_path, updates=6, keep=1)
+    told = "00000005 cannot be deleted (Operation not permitted): delete it yourself"
+    assert caplog.messages == [f"{tmp_path}/{told}"]
+    save(tmp_path, updates=7, keep=1)
+    assert names(tmp_path) == ["00000007"]
+
+
+def test_a_slow_disk_is_no_reason_to_end_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoints, "_PART", 16)
+    beats = list[str]()
+    monkeypatch.setattr(Watchdog, "progress", lambda _: beats.append("alive"))
+    with Watchdog(0.0):
+        path = save(tmp_path)
+        written = len(beats)
+        assert load_checkpoint(path).updates == 5
+    size = sum((path / name).stat().st_size for name in FILES)
+    assert written >= size // 16
+    assert len(beats) - written >= size // 16 - (path / FILES[0]).stat().st_size // 16
+    load_checkpoint(path)  # without a watchdog nobody is told
+    assert len(beats) < 2 * written
 
 
 def test_a_half_written_folder_is_no_checkpoint(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch.utils.tensorboard import SummaryWriter
 
 from master.watch import metrics as metrics_module
-from master.watch.metrics import HPARAMS, Means, Metrics
+from master.watch.metrics import HPARAMS, Means, Metrics, Thinning
 from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast
@@ -45,8 +45,6 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
     assert points(events, "train/q") == [(10, 0.5), (20, 0.75)]
     assert points(events, "replay/fill") == [(20, 1.0)]
     assert points(events, "test/mean_reward") == [(20, 0.9)]
-    assert points(events, "test_by_episodes/mean_reward") == [(300, 0.9)]
-    assert points(events, "test_by_seconds/mean_reward") == [(12, 0.9)]
     (picture,) = events.Images("test/pictures")
     assert (picture.step, picture.width, picture.height) == (20, 6, 4)
     assert "noise: 0.1" in str(events.Tensors("config/text_summary")[0].tensor_proto)
@@ -71,11 +69,40 @@ def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(
                 metrics.scores({"mean_reward": value}, step, 10 * step, step / 10)
         metrics.close()
     assert points(read(tmp_path), "train/q") == [(10, 1.0), (20, 1.0), (30, 2.0)]
-    by_episodes = points(read(tmp_path), "test_by_episodes/mean_reward")
-    assert by_episodes == [(100, 1.0), (200, 1.0), (300, 2.0)]
-    by_seconds = points(read(tmp_path), "test_by_seconds/mean_reward")
-    # What was purged is told by updates: these are fewer, and stay until their steps come again.
-    assert by_seconds == [(1, 1.0), (2, 1.0), (3, 1.0), (3, 2.0)]
+    assert points(read(tmp_path), "test/mean_reward") == [(10, 1.0), (20, 1.0), (30, 2.0)]
+
+
+@pytest.mark.parametrize("place", ["tensorboard", "curve.jsonl"])
+def test_what_lies_in_the_place_of_curves_is_set_aside(
+    place: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What is not needed to go on never stops going on."""
+    folder, curve = tmp_path / "tensorboard", tmp_path / "curve.jsonl"
+    folder.touch() if place == "tensorboard" else curve.mkdir()
+    with closing(Metrics(folder, curve, 5)) as metrics:
+        metrics.scores({"mean_reward": 0.5}, 10, 320, 1.0)
+    assert points(read(folder), "test/mean_reward") == [(10, 0.5)]
+    assert len(lines(curve)) == 1
+    (aside,) = tmp_path.glob("*.aside")
+    assert caplog.messages == [
+        f"{tmp_path / place} was no curve that can be gone on with: it is {aside.name} now"
+    ]
+
+
+def test_curves_of_a_year_have_some_thousand_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    thinning, points, year_s = Thinning(0.0, points=100), list[float](), 365 * 86400.0
+    while now_s[0] < year_s:
+        if thinning.due():
+            points.append(now_s[0])
+        now_s[0] += max(10.0, now_s[0] / 1000.0)
+    assert points[:3] == [0.0, 10.0, 20.0]  # at first all
+    assert len(points) < 100 * (1 + np.log(year_s / 1000.0)) + 1
+    later = Thinning(year_s, points=100)  # in another life
+    assert later.due()
+    now_s[0] += year_s / 200
+    assert not later.due()
 
 
 def test_means_are_weighted_and_begin_anew() -> None:
@@ -143,7 +170,9 @@ def test_what_happens_again_is_dropped(tmp_path: Path, updates: int, kept: list[
 def test_a_line_cut_short_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "curve.jsonl"
     whole = '{"updates": 10, "episodes": 9, "train_s": 1.5}'
-    path.write_text(whole + '\n[3]\n{"updates": "x"}\n' + "[" * 100_000 + '\n{"upda')
+    damaged = b'\n{"updates": 12, "episodes": 9, "train_s\xff": 1.5}'
+    cut = '\n[3]\n{"updates": "x"}\n' + "[" * 100_000 + '\n{"upda'
+    path.write_bytes(whole.encode() + damaged + cut.encode())
     with closing(Metrics(tmp_path, path, 100)) as metrics:
         metrics.scores({}, 20, 0, 0.0)
     assert [line["updates"] for line in lines(path)] == [10, 20]
