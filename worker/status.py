@@ -124,7 +124,8 @@ def _plain(status: RunStatus) -> dict[str, Any]:
 
 def _print(console: Console, status: RunStatus, connect: str) -> None:
     texts = status.texts
-    console.print(f"run {texts.get('run', '?')} ({texts.get('run_id', '?')})", highlight=False)
+    head = f"run {texts.get('run', '?')} ({texts.get('run_id', '?')})"
+    console.print(head, highlight=False, markup=False)
     numbers = defaultdict(lambda: UNKNOWN, status.numbers)
     _print_rows(console, [*_lines(numbers, texts), *_scores(status)])
     if len(status.workers):

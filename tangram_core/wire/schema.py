@@ -84,9 +84,16 @@ class Flag(Bound):
         return value
 
 
+def plain(text: str) -> str:
+    """A text from a peer, with what a terminal would obey written out: an escape as `x1b`."""
+    return "".join(
+        one if one.isprintable() else one.encode("unicode_escape").decode() for one in text
+    )
+
+
 @dataclass(frozen=True)
 class Text(Bound):
-    """A text of at most so many characters, one of the choices if there are any.
+    """A text of at most so many characters, one of the choices if there are any; it comes `plain`.
 
     Attributes:
         longest: most characters.
@@ -107,7 +114,7 @@ class Text(Bound):
             raise _wrong(where, f"one of {', '.join(self.choices)}", value)
         if self.needed and not value:
             raise WireError(f"{where} must not be empty")
-        return value
+        return plain(value)
 
     def fit(self, value: Any) -> Any:
         """The text, cut if it may be."""

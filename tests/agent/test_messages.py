@@ -209,9 +209,8 @@ def values_of(bound: Bound) -> st.SearchStrategy[Any]:
             return st.integers(low, high)
         case Flag():
             return st.booleans()
-        case Text(longest, choices, needed, cut):
-            # Lone surrogates cannot be encoded; no text of ours holds them but reasons.
-            letters = st.characters(exclude_categories=() if cut else ["Cs"])
+        case Text(longest, choices, needed):
+            letters = st.characters().filter(str.isprintable)
             text = st.text(letters, min_size=int(needed), max_size=min(longest, 200))
             return st.sampled_from(sorted(choices)) if choices else text
         case Numbers():
@@ -230,6 +229,27 @@ plain = st.sampled_from([c for k, c in KINDS.items() if k not in DESCRIBED]).fla
 @given(plain)
 def test_plain_messages_come_back_as_they_were_sent(message: Message) -> None:
     assert decode(message.encode(), message.kind) == message
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (kind, name)
+        for kind, bounds in BOUNDS.items()
+        for name, bound in bounds.items()
+        if isinstance(bound, Text | Texts) and not getattr(bound, "choices", ())
+    ],
+)
+def test_no_text_of_a_peer_has_what_a_terminal_obeys(kind: str, name: str) -> None:
+    """Status, logs and errors print them."""
+    wild = "a\x1b[2J\n\u202eb\udcff".encode("utf-8", "surrogatepass")
+    given: Any = wild.decode("utf-8", "replace")
+    if isinstance(BOUNDS[kind][name], Texts):
+        given = {"task": given}
+    found = getattr(decode(with_header(EXAMPLES[kind], **{name: given}), kind), name)
+    text = found["task"] if isinstance(given, dict) else found
+    assert text.startswith("a\\x1b[2J\\n\\u202eb")
+    assert text.isprintable()
 
 
 @given(st.integers(1, BIG), st.integers(-1, BIG), st.integers(1, 5), st.integers(0, 99))
