@@ -16,6 +16,7 @@ import yaml
 
 from master.config import MasterConfig
 from master.record.journal import segments
+from master.record.lease import Lease, LostError
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.run.code import code_of, own_code, read_code
 from tangram_core.run.outcome import FILE_NAME as RESULT
@@ -25,7 +26,7 @@ from tangram_core.store.checkpoints import list_checkpoints
 from tangram_core.store.files import PUBLIC, is_same, make_folders, private, write_whole
 
 PRIVATE = 0o600
-LOCK, LAUNCHER = ".lock", ".launcher"
+LOCK, LAUNCHER, LEASE = ".lock", ".launcher", ".lease.json"
 
 
 class RunFolder:
@@ -188,15 +189,19 @@ class Claim:
             FolderError: it is gone, or another run's, or another process works there.
         """
         path = self.run.path
-        if is_same(self._lock.fileno(), path / self._name):
-            return False
         try:
+            if is_same(self._lock.fileno(), path / self._name):
+                if self._lease is not None:
+                    self._lease.renew()
+                return False
             if not path.is_dir():
                 raise FolderError(f"run_dir {path} is gone")
             if not is_same(self._folder, path) and self.run.holds_more():
                 raise FolderError(f"run_dir {path} is another folder now, with a run in it")
             before = self._lock, self._folder
             self._take()
+        except LostError as error:
+            raise FolderError(f"run_dir {path} is lost: {error}") from None
         except (OSError, ConfigError) as error:
             why = error.strerror if isinstance(error, OSError) else "another process works there"
             raise FolderError(f"run_dir {path} cannot be claimed anew ({why})") from None
@@ -205,6 +210,8 @@ class Claim:
 
     def close(self) -> None:
         """Give the folder back."""
+        if self._lease is not None:
+            self._lease.close()
         self._release(self._lock, self._folder)
 
     def _take(self) -> None:
@@ -212,12 +219,22 @@ class Claim:
         lock = open(self.run.path / self._name, "ab", opener=private)  # noqa: SIM115
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lease = Lease(self.run.path / LEASE) if self._name == LOCK else None
         except BlockingIOError:
             lock.close()
             raise ConfigError(
                 f"run_dir {self.run.path} is in use by another process: choose another run_dir, or "
                 "stop that one first"
             ) from None
+        except OSError as error:
+            lock.close()
+            raise ConfigError(
+                f"{self.run.path / self._name} cannot be locked by flock ({error.strerror}): "
+                "choose a run_dir on a file system that has locks"
+            ) from None
+        except ConfigError:
+            lock.close()
+            raise
         # Open, so that no folder which is made later has the same number.
         self._lock, self._folder = lock, os.open(self.run.path, os.O_RDONLY)
 

@@ -1,0 +1,132 @@
+"""A run folder on a file system whose locks hold on one machine alone."""
+
+import errno
+import fcntl
+import json
+import os
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from master.record import lease as lease_module
+from master.record.lease import Lease
+from master.record.rundir import LEASE, FolderError, RunFolder
+from tangram_core.errors import ConfigError
+
+pytestmark = pytest.mark.fast
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lease_module, "RENEW_S", 0.0)
+    monkeypatch.setattr(lease_module, "LOOK_S", 0.01)
+    monkeypatch.setattr(lease_module, "STALE_S", 0.2)
+
+
+def of_another(folder: Path, age_s: float = 0.0, host: str = "far") -> Path:
+    path = folder / LEASE
+    path.write_text(json.dumps({"host": host, "id": "theirs"}) if host else "")
+    os.utime(path, (time.time() - age_s,) * 2)
+    return path
+
+
+def test_a_process_of_another_machine_that_lives_keeps_its_folder(tmp_path: Path) -> None:
+    path, over = of_another(tmp_path), threading.Event()
+
+    def live() -> None:
+        while not over.wait(0.05):
+            os.utime(path)
+
+    thread = threading.Thread(target=live)
+    thread.start()
+    try:
+        with pytest.raises(ConfigError, match="is in use by a process on far: choose another"):
+            RunFolder(tmp_path).lock()
+    finally:
+        over.set()
+        thread.join()
+    with RunFolder(tmp_path).lock():  # which the one that was refused did not keep
+        assert json.loads(path.read_text())["id"] != "theirs"
+
+
+@pytest.mark.parametrize(
+    ("age_s", "host", "told"),
+    [(0.0, "far", 1), (1000.0, "far", 0), (0.0, socket.gethostname(), 0), (0.0, "", 0)],
+    ids=["silent", "long gone", "of this machine", "after a power cut"],
+)
+def test_one_that_is_gone_leaves_its_folder(
+    age_s: float, host: str, told: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = of_another(tmp_path, age_s, host)
+    with RunFolder(tmp_path).lock() as claim:
+        assert json.loads(path.read_text())["id"] != "theirs"
+        assert claim.check() is False
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+    assert len(caplog.messages) == told
+
+
+def test_who_lost_the_folder_acknowledges_nothing_more(tmp_path: Path) -> None:
+    with RunFolder(tmp_path).lock() as claim:
+        path = of_another(tmp_path)
+        for content in (path.read_text(), ""):
+            path.write_text(content)
+            with pytest.raises(FolderError, match="lost: a process on far has taken it over"):
+                claim.check()
+    assert path.exists()  # it is none of ours
+
+
+def test_one_that_was_tidied_up_is_made_again(tmp_path: Path) -> None:
+    with RunFolder(tmp_path).lock() as claim:
+        (tmp_path / LEASE).unlink()
+        assert claim.check() is False
+        assert (tmp_path / LEASE).exists()
+
+
+def test_of_two_that_take_an_old_one_away_one_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other made its own after this one had looked."""
+    path, real, theirs = of_another(tmp_path, 1000.0), Lease._await_silence, list[str]()
+
+    def late(self: Lease) -> os.stat_result:
+        judged = real(self)
+        if not theirs:
+            theirs.append("theirs, new")
+            path.unlink()
+            path.write_text(json.dumps({"host": "far", "id": theirs[0]}))
+        else:  # put back; its process ends now
+            assert json.loads(path.read_text())["id"] == theirs[0]
+        return judged
+
+    monkeypatch.setattr(Lease, "_await_silence", late)
+    mine = Lease(path)
+    assert json.loads(path.read_text())["id"] == mine._id
+    assert [one.name for one in tmp_path.iterdir()] == [LEASE]
+
+
+def test_a_full_disk_is_no_reason_to_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    lease = Lease(tmp_path / LEASE)
+    lease.renew()
+    lease.close()
+    assert "(No space left on device): other machines are not seen" in caplog.messages[0]
+
+
+def test_a_file_system_without_locks_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", fail)
+    told = r"/\.lock cannot be locked by flock \(No locks available\): choose a run_dir on a file"
+    with pytest.raises(ConfigError, match=told):
+        RunFolder(tmp_path).lock()
