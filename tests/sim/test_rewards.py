@@ -21,11 +21,13 @@ from tangram_sim.rewards import (
     check_reward,
     closeness,
     make_reward,
+    overlap,
     pinned,
     reward_bounds,
     reward_identity,
 )
 from tangram_sim.sight.pictures import BACKGROUND, TOKEN_GRAY, token_pixels
+from tangram_sim.targets.sampling import sample_batch
 from tests.sim.builders import TRIO, layout_of, random_poses
 
 pytestmark = pytest.mark.fast
@@ -277,3 +279,15 @@ def test_files_with_one_name_are_different_rewards(tmp_path: Path) -> None:
         path.write_text(f"def same(achieved, desired, layout): return [{number}] * len(achieved)")
         got.append(reward_of(f"{path}:same", layout)(corners, corners)[0])
     assert got == [1, 2]
+
+
+@pytest.mark.parametrize(("most", "reward"), [(2.0, 0.768), (2.0 * math.tanh(1.0), 0.69)])
+def test_who_never_turns_has_what_docs_paper_tells(most: float, reward: float) -> None:
+    """With moves as long as one tanh allows, and as tanh of tanh does."""
+    square = layout_of("square", scale=0.8 * math.sqrt(2.0))
+    drawn = [np.random.default_rng(n) for n in range(4_000)]
+    starts, goals = (sample_batch(square, SimConfig(overhang=True), drawn) for _ in range(2))
+    ends = starts.copy()
+    ends[..., :2] += (goals - starts)[..., :2].clip(-most, most)
+    found = overlap(square.corners(ends), square.corners(goals), square).mean()
+    assert found == pytest.approx(reward, abs=0.01)
