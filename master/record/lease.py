@@ -91,14 +91,14 @@ class Lease:
 
     def _await_silence(self) -> os.stat_result:
         """Whose it is when its process is gone, as the lock tells of one of this machine."""
-        host, first = self._holder(self._path)[0], self._path.stat()
+        host, first = self._holder(self._path)[0], _fresh(self._path)
         until_s = time.monotonic() + STALE_S - (self._now_s() - first.st_mtime)
         if host != self._host and time.monotonic() < until_s:
             log.warning("waits whether a process on %s works in %s", host, self._path.parent)
         while host != self._host and time.monotonic() < until_s:
             time.sleep(LOOK_S)
             still_alive()
-            if self._path.stat().st_mtime != first.st_mtime:
+            if _fresh(self._path).st_mtime != first.st_mtime:
                 raise ConfigError(
                     f"run_dir {self._path.parent} is in use by a process on {host}: choose another "
                     "run_dir, or stop that one first"
@@ -108,7 +108,7 @@ class Lease:
     def _take_away(self, old: os.stat_result) -> None:
         """Put it out of the way, unless another process did, and has its own there by now."""
         self._path.rename(self._aside)
-        found = self._aside.stat()
+        found = _fresh(self._aside)
         if (found.st_ino, found.st_mtime) != (old.st_ino, old.st_mtime):
             os.link(self._aside, self._path)
         self._aside.unlink()
@@ -116,7 +116,7 @@ class Lease:
     def _now_s(self) -> float:
         """By the clock of the file system."""
         self._aside.touch()
-        now_s = self._aside.stat().st_mtime
+        now_s = _fresh(self._aside).st_mtime
         self._aside.unlink()
         return now_s
 
@@ -127,3 +127,9 @@ class Lease:
             return ascii(found["host"])[1:-1], str(found["id"])
         except (ValueError, KeyError, TypeError, RecursionError):
             return self._host, ""
+
+
+def _fresh(path: Path) -> os.stat_result:
+    """As the server has it: NFS keeps what `stat` tells for a while, and asks when it opens."""
+    with path.open("rb") as file:
+        return os.fstat(file.fileno())
