@@ -31,7 +31,7 @@ def test_a_puzzle_file_and_an_svg_have_the_tokens_where_they_lie(name: str, tmp_
     far = np.linalg.norm(corners[:, None] - wanted[None], axis=-1)
     assert far.min(axis=1).max() < 2e-3
     (tmp_path / "mine.svg").write_bytes(svg(goal))
-    picture = ImageOps.invert(read_svg(tmp_path / "mine.svg", "mine.svg")).getbbox()
+    picture = ImageOps.invert(read_svg(tmp_path / "mine.svg", "mine.svg")[0]).getbbox()
     extent = np.ptp(wanted, axis=0)
     assert picture is not None
     wide, high = picture[2] - picture[0], picture[3] - picture[1]

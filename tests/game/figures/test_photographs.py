@@ -48,7 +48,7 @@ def photo(path: Path, shown: Floats, **save: Any) -> str:
 
 
 def found(path: Path, layout: Layout = LAYOUT) -> Any:
-    return find_tokens(read_picture(path, "target=it"), layout, "target=it")
+    return find_tokens(read_picture(path, "target=it").picture, layout, "target=it")
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -83,7 +83,7 @@ def test_a_token_may_cover_most_of_a_photograph(tmp_path: Path, dark: bool, shar
     corners = layout.corners(np.zeros((1, 3))) * unit + side / 2.0
     ImageDraw.Draw(canvas).polygon([(x, y) for x, y in corners.tolist()], 250 if dark else 20)
     canvas.save(tmp_path / "it.png")
-    picture = read_picture(tmp_path / "it.png", "it")
+    picture = read_picture(tmp_path / "it.png", "it").picture
     assert find_tokens(picture, layout, "it").unit == pytest.approx(unit, rel=0.01)
 
 
@@ -104,7 +104,7 @@ def test_every_kind_of_file_shows_the_same(tmp_path: Path, mode: str) -> None:
     if mode == "RGBA":  # nothing but the tokens is drawn
         picture.putalpha(Image.fromarray(np.where(grey < 200, 255, 0).astype(np.uint8)))
     picture.save(tmp_path / "it.png", exif=exif)
-    read = read_picture(tmp_path / "it.png", "it")
+    read = read_picture(tmp_path / "it.png", "it").picture
     assert (read.mode, read.size) == ("RGB", (450, 300))
     assert found(tmp_path / "it.png").unit == pytest.approx(UNIT, rel=0.02)
 
