@@ -52,7 +52,7 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
     """
     folder = RunFolder(config.run_dir)
     folder.prepare(config.resume)
-    # Between this lock's end and the master's own another training would write its settings.
+    # To the end: else another training could write its settings before the master has its lock.
     with folder.lock(LAUNCHER):
         with folder.lock():
             check_resumable(folder, resolved)

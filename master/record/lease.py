@@ -64,12 +64,12 @@ class Lease:
     def close(self) -> None:
         """Leave the folder to others."""
         with suppress(OSError):
-            if self._holder(self._path)[1] == self._id:
+            if self._holder()[1] == self._id:
                 self._path.unlink()
 
     def _renew(self) -> None:
         try:
-            host, holder = self._holder(self._path)
+            host, holder = self._holder()
         except FileNotFoundError:  # somebody tidied up
             self._made()
             return
@@ -91,7 +91,7 @@ class Lease:
 
     def _await_silence(self) -> os.stat_result:
         """Whose it is when its process is gone, as the lock tells of one of this machine."""
-        host, first = self._holder(self._path)[0], _fresh(self._path)
+        host, first = self._holder()[0], _fresh(self._path)
         until_s = time.monotonic() + STALE_S - (self._now_s() - first.st_mtime)
         if host != self._host and time.monotonic() < until_s:
             log.warning("waits whether a process on %s works in %s", host, self._path.parent)
@@ -120,10 +120,10 @@ class Lease:
         self._aside.unlink()
         return now_s
 
-    def _holder(self, path: Path) -> tuple[str, str]:
-        """Host and id in a file; one that a power cut took the content of is of nobody else."""
+    def _holder(self) -> tuple[str, str]:
+        """Host and id in the file; one that a power cut took the content of is of nobody else."""
         try:
-            found = json.loads(path.read_bytes())
+            found = json.loads(self._path.read_bytes())
             return ascii(found["host"])[1:-1], str(found["id"])
         except (ValueError, KeyError, TypeError, RecursionError):
             return self._host, ""

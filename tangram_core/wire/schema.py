@@ -86,6 +86,8 @@ class Flag(Bound):
 
 def plain(text: str) -> str:
     """A text from a peer, with what a terminal would obey written out: an escape as `x1b`."""
+    if text.isprintable():
+        return text
     return "".join(
         one if one.isprintable() else one.encode("unicode_escape").decode() for one in text
     )

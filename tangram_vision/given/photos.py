@@ -215,7 +215,8 @@ def _coverage(picture: Image.Image) -> Singles:
     sign = np.float32(-1.0 if dark else 1.0)
     differs *= sign
     cover = np.zeros_like(differs)
-    if noise <= 1.0:  # a drawing: yellow on white differs in blue alone, and a shadow has no colour
+    # In a drawing yellow on white differs in blue alone, and a shadow has no colour.
+    if noise <= 1.0 and (np.ptp(colours, axis=0) > contrast).any():
         each = [sign * (_light(colour)[0] - colour) for colour in colours]
         coloured = np.ptp(each, axis=0) > contrast
         differs = np.maximum(differs, np.max(each, axis=0))

@@ -61,7 +61,7 @@ def read_svg(path: Path, source: str) -> tuple[Image.Image, tuple[float, float],
         raise ConfigError(f"{source} draws nothing that has an area: draw an outline")
     (left, *_, right), (top, *_, low) = (one[[0, -1]] for one in there)
     page = _page(root)
-    told = [re.match(r"[\d.]+(?!.*%)", root.get(name, "")) for name in ("width", "height")]
+    told = [re.match(r"\d+(\.\d+)?(?!.*%)", root.get(name, "")) for name in ("width", "height")]
     shown = pixels[top : low + 1, left : right + 1]
     figure = _figure(shown)
     # A page of another colour than white would be a figure itself.
@@ -130,7 +130,8 @@ def _page(root: ET.Element) -> Floats | None:
         page = np.array([float(one) for one in re.split(r"[\s,]+", told.strip())])
     except ValueError:
         return None
-    return page if page.shape == (4,) and page[2:].min() > 0.0 else None
+    told_all = page.shape == (4,) and np.isfinite(page).all()
+    return page if told_all and page[2:].min() > 0.0 else None
 
 
 def _reaches_out(root: ET.Element, page: Floats | None, source: str) -> bool:

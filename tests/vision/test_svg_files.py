@@ -126,7 +126,12 @@ def test_a_point_of_the_picture_is_known_in_the_file(
 
 
 def test_a_page_that_is_not_told_or_stretched_is_the_picture(tmp_path: Path) -> None:
-    for page in ("", 'width="9cm" height="9cm"', 'viewBox="0 0 300 300" width="9cm" height="5cm"'):
+    for page in (
+        "",
+        'width="." height="1.2.3"',
+        'width="9cm" height="9cm"',
+        'viewBox="0 0 300 300" width="9cm" height="5cm"',
+    ):
         drawn, size, own = read_whole(tmp_path, f"<svg {XMLNS} {page}>{HALF}</svg>")
         assert size == drawn.size
         assert own.tolist() == np.eye(3).tolist()

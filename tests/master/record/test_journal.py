@@ -420,6 +420,25 @@ def test_one_from_before_keys_owned_what_they_sent_is_read(tmp_path: Path) -> No
     assert [(found.process, found.owner) for found in read(tmp_path)] == [("p", ""), ("", "")]
 
 
+def test_a_segment_that_cannot_be_deleted_is_told_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = journal(tmp_path, MADE)
+    kept.append(arrival(MADE, 1))
+    kept.rotate()
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        kept.drop_before(2)
+    told = "00000001.log cannot be deleted (Operation not permitted): delete it yourself"
+    assert caplog.messages == [f"{tmp_path}/{told}"]
+    kept.append(arrival(MADE, 2))
+    assert sequences(tmp_path) == [1, 2]
+
+
 FORGED: dict[str, tuple[dict[str, Any], str]] = {
     "2^63-1": ({"incarnation": 2**63 - 1}, "batch: incarnation must be an integer between 1 and"),
     "2^53+1": ({"incarnation": 2**53 + 1}, "batch: incarnation must be an integer between 1 and"),

@@ -92,17 +92,27 @@ def test_what_lies_in_the_place_of_curves_is_set_aside(
 def test_curves_of_a_year_have_some_thousand_points(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
-    thinning, points, year_s = Thinning(0.0, points=100), list[float](), 365 * 86400.0
+    thinning, points, year_s = Thinning(0.0), list[float](), 365 * 86400.0
     while now_s[0] < year_s:
         if thinning.due():
             points.append(now_s[0])
-        now_s[0] += max(10.0, now_s[0] / 1000.0)
-    assert points[:3] == [0.0, 10.0, 20.0]  # at first all
-    assert len(points) < 100 * (1 + np.log(year_s / 1000.0)) + 1
-    later = Thinning(year_s, points=100)  # in another life
+        now_s[0] += max(2.0, now_s[0] / 20_000.0)
+    assert points[:3] == [0.0, 2.0, 4.0]  # at first all
+    assert len(points) < 20_000
+    later = Thinning(year_s)  # in another life
     assert later.due()
-    now_s[0] += year_s / 200
+    now_s[0] += year_s / 4000
     assert not later.due()
+
+
+def test_what_is_thinned_out_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Thinning, "due", lambda _: False)
+    with closing(Metrics(tmp_path, tmp_path / "curve.jsonl")) as metrics:
+        metrics.scores({"mean_reward": 0.5}, 10, 320, 1.0)
+    assert not (tmp_path / "curve.jsonl").exists()
+    assert read(tmp_path).Tags()["scalars"] == []
 
 
 def test_means_are_weighted_and_begin_anew() -> None:
