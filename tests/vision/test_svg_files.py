@@ -128,7 +128,7 @@ def test_a_point_of_the_picture_is_known_in_the_file(
 def test_a_page_that_is_not_told_or_stretched_is_the_picture(tmp_path: Path) -> None:
     for page in (
         "",
-        'width="." height="1.2.3"',
+        'viewBox="0 0 300 300" width="1.2.3" height="9"',
         'width="9cm" height="9cm"',
         'viewBox="0 0 300 300" width="9cm" height="5cm"',
     ):
