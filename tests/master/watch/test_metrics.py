@@ -201,3 +201,18 @@ def test_a_point_stands_where_its_weights_were_sent(tmp_path: Path) -> None:
     (line,) = lines(tmp_path / "curve.jsonl")
     assert (line["updates"], line["episodes"], line["train_s"]) == (0, 0, 0.0)
     assert line["mean_reward"] == 0.25
+
+
+@pytest.mark.parametrize("due", [True, False])
+def test_points_of_an_old_run_are_written_when_they_are_due(
+    due: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = small_setup()
+    moved = loop(tmp_path, made, FakeHub(made, [[scores(made, version=0)]]))
+    moved.publish()
+    monkeypatch.setattr(Thinning, "due", lambda _: due)
+    moved.receive(0.0)
+    moved.reporter.flush(0)
+    moved.reporter.metrics.close()
+    tags = read(next(tmp_path.glob("**/events.*")).parent).Tags()
+    assert ("run/updates" in tags["scalars"], "test/pictures" in tags["images"]) == (due, due)
