@@ -2,11 +2,11 @@
 
 import logging
 import time
-from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 from master.checkpointer import Checkpointer
+from master.hub.fair import FairQueue
 from master.hub.hub import Hub
 from master.learn.budget import Budget
 from master.learn.divergence import DivergenceGuard
@@ -20,8 +20,9 @@ from tangram_core.run.process import Every, Watchdog
 from tangram_core.run.service import ServiceConfig
 from tangram_core.wire.messages import RunStatus
 
-# Between two looks at the sockets: learning goes on for so long, or idleness lasts.
+# Between two looks at the sockets: learning goes on for so long, inserting, or idleness lasts.
 LEARN_S = 0.05
+INSERT_S = 0.02
 IDLE_S = 0.05
 # At the end: for the scores of the final weights, the same after a signal, and for goodbyes.
 SCORES_S = 120.0
@@ -50,7 +51,7 @@ class Loop:
     reporter: Reporter
     signals: StopSignals
     watchdog: Watchdog
-    _arrived: deque[EpisodesArrived] = field(default_factory=deque, init=False)
+    _arrived: FairQueue[EpisodesArrived] = field(default_factory=FairQueue, init=False)
     _published: int = field(default=-1, init=False)
     _dismissed: bool = field(default=False, init=False)
 
@@ -61,11 +62,12 @@ class Loop:
     def run(self) -> str:
         """Learn until a bound or a signal ends it; returns which."""
         self.publish()
+        more = False
         while (reason := self.over()) is None:
-            self.receive(0.0 if self.may_learn() else IDLE_S)
+            self.receive(0.0 if more or self.may_learn() else IDLE_S)
             self.clock.advance(training=self._trainer.episodes > 0)
             if self.lockstep is None:
-                self.insert()
+                more = self.insert()
             else:
                 self.insert_round(self.lockstep)
             self.learn()
@@ -89,21 +91,33 @@ class Loop:
             if isinstance(arrival, ScoresArrived):
                 self.reporter.scored(arrival.scores)
             else:
-                self._arrived.append(arrival)
+                self._arrived.put(arrival.owner, arrival)
         record = self.clock.record
         record.workers = max(record.workers, self.hub.count("player"))
 
-    def insert(self) -> None:
-        """Move batches into the replay while the learner keeps up; senders of others wait."""
-        while self._arrived and self._limiter.may_insert() and self.budget.takes_episodes():
-            if not self.checkpointer.keep(self._arrived[0]):
-                return
-            self._insert(self._arrived.popleft())
+    def insert(self) -> bool:
+        """Move batches into the replay while the learner keeps up; senders of others wait.
+
+        By turns of keys, so that each has an equal share of what is learned from.
+
+        Returns:
+            Whether there may be more that could be inserted at once.
+        """
+        until_s = time.monotonic() + INSERT_S
+        while len(self._arrived) and self._limiter.may_insert() and self.budget.takes_episodes():
+            if time.monotonic() >= until_s:
+                return True
+            arrival = self._arrived.first()
+            if not self.checkpointer.keep(arrival):
+                return False
+            self._insert(self._arrived.serve(arrival.episodes.transitions))
+        return False
 
     def insert_round(self, lockstep: Lockstep) -> None:
         """In lockstep: insert a round when it is whole, order the next when it is learned."""
-        while self._arrived:
-            lockstep.take(self._arrived.popleft())
+        while len(self._arrived):
+            self._arrived.first()
+            lockstep.take(self._arrived.serve(0.0))
         if self.may_learn():
             return
         if not lockstep.ordered:

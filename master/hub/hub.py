@@ -10,10 +10,12 @@ journalled and inserted, and the unacknowledged batches of one peer are bounded 
 
 import secrets
 import time
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Self
 
 from master.hub.admission import Admission, WelcomeInfo
+from master.hub.fair import FairQueue
 from master.hub.gate import AMPLE, Room
 from master.hub.registry import Askers, Peer
 from master.hub.security import Holder, Keys
@@ -49,8 +51,11 @@ from tangram_core.wire.messages import (
 )
 from tangram_core.wire.schema import DamagedError, ProtocolError
 
-# Most messages taken in one poll, so that the loop gets its turn under any load.
-MAX_DRAIN = 256
+# What one poll spends under any load on reading and on answering, so that the loop gets its turn.
+READ_S, SERVE_S = 0.005, 0.01
+# Bytes of one key that are read and not answered yet; what is more is dropped, and sent again by
+# those that keep the rules. A message counts for so much at least.
+INBOX_BYTES, LEAST_BYTES = 128 * 2**20, 1024
 # Damaged messages of one peer without an intact batch between them: then it must end.
 MAX_DAMAGED = 100
 # Of broadcasts to all workers together: half of a gigabit line, and what a fifteenth of a core
@@ -96,7 +101,8 @@ class Hub:
         self._version, self._exams = -1, Exams()
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
-        self._askers = Askers()
+        self._askers = defaultdict[str, Askers](Askers)
+        self._inbox, self._unread = FairQueue[Received](), Counter[str]()
         self._orders: dict[int, Go] = {}
         self._waiting = Waiting(info.window)
         self.counters = Counters()
@@ -137,26 +143,22 @@ class Hub:
 
     def poll(self, timeout_s: float) -> list[Arrival]:
         """Wait for a message, answer what is there; returns what is new, in the order it came."""
-        arrivals: list[Arrival] = []
         self._sockets.listen_again()
         self._admission.drop_revoked()  # first: a flood must not keep anybody in
-        if self._sockets.wait(timeout_s):
-            for _ in range(MAX_DRAIN):
-                received = self._sockets.receive()
-                if received is None:
-                    break
-                arrival = self._heard(received)
-                if arrival is not None:
-                    arrivals.append(arrival)
-            else:  # more is waiting, perhaps from those who seem silent
+        if len(self._inbox) or self._sockets.wait(timeout_s):
+            all_read = self._read()
+            arrivals = self._serve()
+            if len(self._inbox) or not all_read:  # perhaps of those who seem silent
                 return arrivals
+        else:
+            arrivals = []
         self._admission.drop_silent(time.monotonic())
         return arrivals
 
     def acknowledge(self, arrival: EpisodesArrived) -> None:
         """Tell the worker that its batch is safe; once for each arrival, after its insert."""
         key = (arrival.role, arrival.index)
-        self._waiting.done(key)
+        self._waiting.done(arrival)
         ledger = self._registry.ledger(key, arrival.incarnation)
         if ledger is None or not ledger.release(arrival.sequence):
             return  # a newer process has the index, or this was told before
@@ -210,6 +212,35 @@ class Hub:
         """Close the sockets; answers that are on their way get a second."""
         self._sockets.close()
 
+    def _read(self) -> bool:
+        """Take what came into the inbox; False if there is more."""
+        until_s = time.monotonic() + READ_S
+        while (received := self._sockets.receive()) is not None:
+            key, size = received.holder.name, _size(received)
+            if self._unread[key] and self._unread[key] + size > INBOX_BYTES:
+                self.counters.note("crowded_out", f"the key '{key}' sends more than can be read")
+            else:
+                self._unread[key] += size
+                self._inbox.put(key, received)
+            if time.monotonic() >= until_s:
+                return False
+        return True
+
+    def _serve(self) -> list[Arrival]:
+        """Answer what was read, each key for an equal time; returns what is new."""
+        arrivals: list[Arrival] = []
+        begun_s = last_s = time.monotonic()
+        while len(self._inbox):
+            arrival = self._heard(self._inbox.first())
+            now_s = time.monotonic()
+            received = self._inbox.serve(now_s - last_s)
+            self._unread[received.holder.name] -= _size(received)
+            if arrival is not None:
+                arrivals.append(arrival)
+            if (last_s := now_s) >= begun_s + SERVE_S:
+                break
+        return arrivals
+
     def _heard(self, received: Received) -> Arrival | None:
         """Read a message, if its sender still has a key; returns what is new."""
         identity, frames, holder, self._address = received
@@ -244,7 +275,7 @@ class Hub:
         """Those who need not take part, and those who may not any more."""
         peer = self._admission.find(identity, self._caller)
         if isinstance(message, AskStatus):
-            if not self._askers.may_have(identity, time.monotonic()):
+            if not self._askers[self._caller.name].may_have(identity, time.monotonic()):
                 self.counters["status_asked_again"] += 1
             elif self._status is not None:
                 self._sockets.send(identity, self._status)
@@ -328,9 +359,10 @@ class Hub:
         self.counters["batches"] += 1
         self.counters["episodes"] += batch.episodes.count
         self._orders.pop(peer.index, None)
-        self._waiting.add(peer.key)
         who = (peer.role, peer.index, peer.incarnation)
-        return EpisodesArrived(*who, batch, frames, peer.process, peer.ledger.owner)
+        arrival = EpisodesArrived(*who, batch, frames, peer.process, peer.ledger.owner)
+        self._waiting.add(arrival)
+        return arrival
 
     def _is_ordered(self, peer: Peer, batch: EpisodeBatch) -> bool:
         """Whether a new batch is what the player was told to play; else it is told again."""
@@ -384,3 +416,8 @@ class Hub:
         """In lockstep: tell a player, who may have missed it, what is still to play."""
         if peer.role == "player" and peer.index in self._orders:
             self._sockets.answer(peer.identity, self._orders[peer.index])
+
+
+def _size(received: Received) -> int:
+    """Bytes that a message counts for."""
+    return max(LEAST_BYTES, sum(map(len, received.frames)))

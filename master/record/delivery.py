@@ -19,8 +19,8 @@ from tangram_core.spec import Episodes
 from tangram_core.wire.messages import Ack, EpisodeBatch, Reject, Scores
 
 REMEMBERED_VERSIONS = 4096
-# Peers that have left and whose batches still wait.
-SPARE_PEERS = 64
+# Of one key: peers that have left and whose batches still wait, and bytes of all that wait.
+SPARE_PEERS, MAX_BYTES = 64, 512 * 2**20
 MAX_EVALUATORS = 16  # that score the same weights
 
 
@@ -159,27 +159,35 @@ class Ledger:
 class Waiting:
     """Batches that wait for their insert, of all processes that have an index one after another.
 
-    At most a window of one index.
+    At most a window of one index, and `MAX_BYTES` of one key.
     """
 
     def __init__(self, window: int) -> None:
         self._window, self._of = window, Counter[tuple[str, int]]()
+        self._batches, self._bytes = Counter[str](), Counter[str]()  # of a key
 
-    def add(self, key: tuple[str, int]) -> None:
-        """One more of an index."""
-        self._of[key] += 1
+    def add(self, arrival: EpisodesArrived) -> None:
+        """One more."""
+        self._count(arrival, 1)
 
-    def done(self, key: tuple[str, int]) -> None:
+    def done(self, arrival: EpisodesArrived) -> None:
         """One less."""
-        self._of[key] -= 1
-        if self._of[key] <= 0:
-            del self._of[key]  # their sum is taken for each batch
+        self._count(arrival, -1)
 
     def room(self, key: tuple[str, int], ledger: Ledger, peers: int) -> int:
         """How many of a process may be held, while so many peers take part."""
-        if self._of.total() >= self._window * (peers + SPARE_PEERS):
+        crowd = self._batches[ledger.owner] >= self._window * (peers + SPARE_PEERS)
+        if crowd or self._bytes[ledger.owner] >= MAX_BYTES:
             return 0
         return self._window - self._of[key] + len(ledger.held)
+
+    def _count(self, arrival: EpisodesArrived, sign: int) -> None:
+        key, owner = (arrival.role, arrival.index), arrival.owner
+        self._batches[owner] += sign
+        self._bytes[owner] += sign * sum(map(len, arrival.frames))
+        self._of[key] += sign
+        if not self._of[key]:
+            del self._of[key]  # indices come and go
 
 
 class Exams:

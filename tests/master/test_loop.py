@@ -85,6 +85,15 @@ def test_batches_wait_unacknowledged_while_the_learner_is_behind(tmp_path: Path)
     assert hub.values("acknowledge") == [1, 2, 3]
 
 
+def test_each_key_has_an_equal_share_of_what_is_learned_from(tmp_path: Path) -> None:
+    greedy = [replace(arrival(MADE, i, BATCH), owner="m") for i in range(1, 9)]
+    other = [replace(arrival(MADE, i, BATCH), owner="a") for i in range(11, 14)]
+    made = loop(tmp_path, MADE, hub := FakeHub(MADE, [greedy + other]), lag_updates=64)
+    made.receive(0.0)
+    made.insert()
+    assert hub.values("acknowledge") == [1, 11, 2, 12, 3, 13, 4, 5, 6, 7, 8]
+
+
 def test_sockets_are_served_between_updates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

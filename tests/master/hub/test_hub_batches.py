@@ -201,7 +201,7 @@ def test_batches_that_wait_are_bounded_over_those_who_have_left(
     stage.hub.acknowledge(stage.batches()[0])
     late.send(1)
     stage.counted("batches", WINDOW + 1)
-    for arrival in stage.batches():
+    for arrival in stage.batches()[1:]:
         stage.hub.acknowledge(arrival)
     assert not stage.hub._waiting._of
 

@@ -392,7 +392,7 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
             loud = raw(stage, keys, keys.player)
             assert asked(stage, loud, Heartbeat({})) == Greet()
             with monkeypatch.context() as flooded:
-                flooded.setattr("master.hub.hub.MAX_DRAIN", 1)
+                flooded.setattr("master.hub.hub.READ_S", 0.0)
 
                 def shouted() -> int:
                     with suppress(zmq.Again):
