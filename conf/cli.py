@@ -26,7 +26,14 @@ from conf.commands import COMMANDS, GROUPS, Plain
 from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of, with_usual_agent
 from conf.own import with_named_code, without_named_code
-from tangram_core.errors import ConfigError, TangramError
+from tangram_core.errors import (
+    UNAVAILABLE_STATUS,
+    USAGE_STATUS,
+    ConfigError,
+    TangramError,
+    UnavailableError,
+    is_passing,
+)
 from tangram_core.registry import TASK
 from tangram_core.run.code import names_modules, unquoted
 from tangram_core.settings import CONTROL
@@ -37,7 +44,6 @@ if TYPE_CHECKING:
 # From the settings of a command: where the groups of a run are named, and these; None for nowhere.
 Stored = Callable[[Plain], tuple[str, Plain] | None]
 
-USAGE_STATUS = 2
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
@@ -55,8 +61,8 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         stored: the groups of a run that the settings name otherwise than by `from_config`.
 
     Returns:
-        The task's status; 2 after a TangramError or a wrong command line, which are told in one
-        line on stderr.
+        The task's status; 2 after a TangramError or a wrong command line, 75 where the environment
+        lacks something. These are told in one line on stderr.
     """
     command = COMMANDS[config_name].name
     arguments = sys.argv[1:]
@@ -93,7 +99,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         # What a user gave may hold line breaks and the terminal's control characters.
         line = CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(error))
         print(f"{command}: {line}", file=sys.stderr)
-        return USAGE_STATUS
+        return UNAVAILABLE_STATUS if isinstance(error, UnavailableError) else USAGE_STATUS
     finally:
         gc.enable()
 
@@ -206,14 +212,15 @@ def _composed_once(config_name: str, overrides: list[str]) -> "DictConfig":
 
 def _as_ours(error: Exception) -> TangramError:
     """A full disk, missing permission or too little memory as an error of one line."""
+    kind = UnavailableError if is_passing(error) else TangramError
     if isinstance(error, TangramError):
-        return error
+        return kind(str(error))
     if isinstance(error, OSError):
-        return TangramError(
+        return kind(
             f"cannot use {error.filename or 'a file'} ({error.strerror or error}): make room or "
             "choose a folder that you may write to"
         )
-    return TangramError(
+    return kind(
         f"not enough memory ({error}): lower agent.replay_capacity, agent.batch_size or "
         "service.envs"
     )

@@ -14,6 +14,7 @@ from threading import Thread
 import psutil
 
 from master.forking import Body, run_command, start
+from tangram_core.errors import UNAVAILABLE_STATUS, USAGE_STATUS
 from tangram_core.run.process import Lifeline
 
 # A process that lived for so long starts with a clean record.
@@ -21,8 +22,8 @@ STEADY_S = 60.0
 MAX_RESTARTS = 5
 FIRST_DELAY_S = 0.5
 MAX_DELAY_S = 30.0
+MAX_WAIT_S = 300.0  # for what the environment lacks, however often
 HUNG_STATUS = 1  # of a watchdog, though others use it, too
-USAGE_STATUS = 2
 TAIL_LINES = 12
 
 
@@ -36,6 +37,7 @@ class Child:
         nice: added to its niceness.
         patience_s: without progress before its watchdog ends it, 0 for none.
         restarts: in a row, without a steady time between.
+        wait_s: until the next start, where the environment lacks something, else 0.
         next_start_s: monotonic time of the next start, None while nothing is planned.
         body: what runs in the process with the arguments.
     """
@@ -46,6 +48,7 @@ class Child:
     nice: int = 0
     patience_s: float = 0.0
     restarts: int = 0
+    wait_s: float = 0.0
     next_start_s: float | None = 0.0
     body: Body = run_command
     _process: ForkServerProcess | None = field(default=None, init=False)
@@ -68,7 +71,7 @@ class Child:
         """Start a process; `ended` is called with this, in another thread, when it ends.
 
         Raises:
-            TangramError: no process can be started.
+            TangramError: no process can be started; UnavailableError where one may be later.
         """
         self.next_start_s, self._started_s, self._frozen_s = None, time.monotonic(), 0.0
         self._lifeline = Lifeline()
@@ -96,19 +99,30 @@ class Child:
     def plan_restart(self, status: int) -> bool:
         """Plan the next start with a growing delay; False to give up.
 
-        Status 2 is wrong input, which does not mend itself.
+        Status 2 is wrong input, which does not mend itself. What 75 tells of may take an hour, and
+        is no failure of the process.
         """
         now_s = time.monotonic()
         # One that hung from its beginning lived for as long as its watchdog let it.
         hung = status == HUNG_STATUS or self._frozen_s > 0.0
         if now_s - self._started_s >= STEADY_S + (self.patience_s if hung else 0.0):
-            self.restarts = 0
+            self.restarts, self.wait_s = 0, 0.0
+        if status == UNAVAILABLE_STATUS:
+            self.wait_s = min(max(2.0 * self.wait_s, FIRST_DELAY_S), MAX_WAIT_S)
+            self.next_start_s = now_s + self.wait_s
+            return True
+        self.wait_s = 0.0
         if status == USAGE_STATUS or self.restarts >= MAX_RESTARTS:
             return False
         delay_s = min(FIRST_DELAY_S * 2.0**self.restarts, MAX_DELAY_S)
         self.restarts += 1
         self.next_start_s = now_s + delay_s
         return True
+
+    @property
+    def plan(self) -> str:
+        """The next start in words."""
+        return f"in {self.wait_s:g} s" if self.wait_s else f"{self.restarts} of {MAX_RESTARTS}"
 
     def tell(self, line: str) -> bool:
         """Send a line to the process; False where it cannot take it."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from setproctitle import setproctitle
 
 from master.signals import SIGNALS
-from tangram_core.errors import TangramError
+from tangram_core.errors import TangramError, UnavailableError, is_passing
 from tangram_core.run.process import VARIABLE
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -70,7 +70,8 @@ def start(
         read_end: of its lifeline.
 
     Raises:
-        TangramError: the server does not start, or was killed just now.
+        UnavailableError: the server was killed just now, or there is no room for a process.
+        TangramError: it cannot start.
     """
     _context.set_forkserver_preload(["tangram_cli.forkserver"])
     with Connection(os.dup(read_end), writable=False) as lifeline:
@@ -79,7 +80,9 @@ def start(
             _ensure_server()
             process.start()
         except (EOFError, OSError) as error:
-            raise TangramError(
+            later = isinstance(error, EOFError | ConnectionError | BlockingIOError)
+            kind = UnavailableError if later or is_passing(error) else TangramError
+            raise kind(
                 f"no process can be started ({error}): is TMPDIR, or /tmp, a short path that can "
                 "be written to, is the current folder still there, and is memory left?"
             ) from error

@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Any
 
-from master.children import MAX_RESTARTS, Child, describe
+from master.children import Child, describe
 from master.config import MasterConfig
 from master.forking import warm_up
 from master.hub.security import listening_place
@@ -19,7 +19,9 @@ from master.record.rundir import LAUNCHER, RunFolder
 from master.signals import SAME_WISH_S, SIGNALS, show_cursor, stop_notice
 from master.watch.console import logging_to, sturdy_console
 from master.watch.result import show_finished
+from tangram_core.errors import UNAVAILABLE_STATUS, USAGE_STATUS, UnavailableError
 from tangram_core.run.code import code_of, override
+from tangram_core.run.outcome import CTRL_C
 from tangram_core.run.process import WATCHDOG_S, Every, handling, watch_parent
 from tangram_core.wire.messages import TAKEN_OVER
 
@@ -33,6 +35,7 @@ FAILED_STATUS = 1
 TAKE_BACK_S = 30.0
 PLAYER_NICE = 5
 EVALUATOR_NICE = 10
+GO_ON = "the same command with resume=auto goes on from what it kept"
 
 log = logging.getLogger(__name__)
 
@@ -107,18 +110,17 @@ class Launcher:
 
     def run(self) -> int:
         """Run until the master has ended; returns the exit status for the user."""
-        starting = Thread(target=warm_up, daemon=True)
-        starting.start()
-        while starting.is_alive():  # it takes seconds, minutes from a slow disk
-            event = self._next_event()
-            if isinstance(event, signal.Signals):
-                return 128 + event
-        self._master.start(self._events.put)
+        number = self._warm_up()
+        if number is not None:
+            return 128 + number
         while True:
             self._start_due()
             self._kill_frozen()
             event = self._next_event()
             if isinstance(event, signal.Signals):
+                if self._master.next_start_s is not None:  # nothing runs that has to be saved
+                    self._say(f"{CTRL_C.get(event.name, event.name)}: the run ends; {GO_ON}")
+                    return 128 + event
                 self._signalled(event)
             elif event is self._master:
                 status = self._master.clear()
@@ -126,6 +128,8 @@ class Launcher:
                     return self._master_ended(status)
             elif event is not None:
                 self._worker_ended(event)
+                if self._failed and self._master.next_start_s is not None:
+                    return FAILED_STATUS
             elif self._stop_s is not None and time.monotonic() >= self._stop_s:
                 self._kill_all()
                 log.info("the master does not end within %g s: it is killed", STOP_S)
@@ -147,6 +151,16 @@ class Launcher:
     def _workers(self) -> list[Child]:
         return [*self._players, self._evaluator]
 
+    def _warm_up(self) -> signal.Signals | None:
+        """Wait until processes can be started; returns the signal that came meanwhile."""
+        starting = Thread(target=warm_up, daemon=True)
+        starting.start()
+        while starting.is_alive():  # it takes seconds, minutes from a slow disk
+            event = self._next_event()
+            if isinstance(event, signal.Signals):
+                return event
+        return None
+
     def _start_due(self) -> None:
         """Start the workers once the master can be reached, and again whose delay is over."""
         if self._stop_s is not None:
@@ -155,7 +169,12 @@ class Launcher:
         self._reached = self._reached or reachable
         for child in [self._master, *(self._workers if reachable else ())]:
             if child.next_start_s is not None and time.monotonic() >= child.next_start_s:
-                child.start(self._events.put)
+                try:
+                    child.start(self._events.put)
+                except UnavailableError as error:
+                    child.clear()
+                    child.plan_restart(UNAVAILABLE_STATUS)
+                    self._say(f"{child.name}: {error} (tried again {child.plan})")
 
     def _kill_frozen(self) -> None:
         if not self._look.due():
@@ -206,21 +225,17 @@ class Launcher:
             "resume=auto" if text.startswith("resume=") else text for text in self._master.arguments
         ]
         log.info(
-            "the master ended with %s: it goes on from what it left (%d of %d)",
+            "the master ended with %s: it goes on from what it left (%s)",
             describe(status),
-            self._master.restarts,
-            MAX_RESTARTS,
+            self._master.plan,
         )
         return True
 
     def _master_ended(self, status: int) -> int:
         # A master that ends in order has told its workers.
         self._sent_home = status == 0
-        if status not in (0, 2):  # 2: it has told what is wrong
-            self._say(
-                f"the master ended with {describe(status)}; the same command with resume=auto "
-                "goes on from what it kept"
-            )
+        if status not in (0, USAGE_STATUS):  # with 2 it has told what is wrong
+            self._say(f"the master ended with {describe(status)}; {GO_ON}")
         if self._failed:
             return FAILED_STATUS
         return 128 - status if status < 0 else status
@@ -235,9 +250,10 @@ class Launcher:
         if status == 0 and TAKEN_OVER in child.tail(1):
             self._make_way(child)
         elif child.plan_restart(status):
+            lacks = f"\n{child.tail(1)}" if child.wait_s else ""
             self._say(
-                f"{child.name} ended with {describe(status)}: it is started again "
-                f"({child.restarts} of {MAX_RESTARTS}); see {child.log}"
+                f"{child.name} ended with {describe(status)}: it is started again ({child.plan}); "
+                f"see {child.log}{lacks}"
             )
         else:
             self._say(f"{child.name} ended with {describe(status)}: given up\n{child.tail()}")

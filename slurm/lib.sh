@@ -2,6 +2,9 @@
 # under set -euo pipefail.
 # shellcheck shell=bash
 
+UNAVAILABLE_STATUS=75 # the environment lacks something, and may have it again by itself
+MOST_WAIT_S=300
+LOOK_S=2 # between two looks, for a file or a signal
 GOODBYE_S=15 # for workers to leave after the master, before the job ends and takes them along
 
 RUN_DIR=$(realpath -m -- "$RUN_DIR")
@@ -90,6 +93,21 @@ await() {
         if ((status <= 128)) || ! kill -0 "$1" 2>/dev/null; then
             return 0
         fi
+    done
+}
+
+# Whether to start again what ended with `status`, because the environment lacked something. Waits
+# before, twice as long each time in a row, unless a signal sets `leaving`.
+leaving=
+wait_s=1
+try_later() { # WHO
+    local slept
+    ((status == UNAVAILABLE_STATUS)) || return 1
+    wait_s=$((2 * wait_s < MOST_WAIT_S ? 2 * wait_s : MOST_WAIT_S))
+    say "$1 ended with status $status: it is started again in $wait_s s"
+    for ((slept = 0; slept < wait_s; slept += LOOK_S)); do
+        sleep "$LOOK_S"
+        [[ -z $leaving ]] || return 1
     done
 }
 

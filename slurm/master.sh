@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The master, inside of its job step: as many threads as the step has CPUs.
+# The master, inside of its job step: as many threads as the step has CPUs. It is started again for as
+# long as the environment lacks something, such as room on a disk.
 #
 #   RUN_DIR=... master.sh [SETTING...]
 set -euo pipefail
@@ -9,4 +10,21 @@ source "$PROJECT/slurm/lib.sh"
 
 threads=${SLURM_CPUS_PER_TASK:-1}
 export OMP_NUM_THREADS=$threads MKL_NUM_THREADS=$threads OPENBLAS_NUM_THREADS=$threads
-become tangram-master "$(setting run_dir "$RUN_DIR")" resume=auto "service.threads=$threads" "$@"
+child=
+
+leave() { # SIGNAL
+    leaving=1
+    [[ -z $child ]] || kill "-$1" "$child" 2>/dev/null || true
+}
+for signal in TERM INT HUP USR1; do
+    # shellcheck disable=SC2064 # the name as it is now
+    trap "leave $signal" "$signal"
+done
+
+while true; do
+    become tangram-master "$(setting run_dir "$RUN_DIR")" resume=auto "service.threads=$threads" "$@" &
+    child=$!
+    await "$child"
+    child=
+    try_later "the master" || exit "$status"
+done

@@ -7,8 +7,7 @@
 set -euo pipefail
 
 STAY=${STAY:-}
-PATIENCE_S=${PATIENCE_S:-1800} # for a master that is not there, perhaps in a queue
-LOOK_S=2                       # between two looks for the connection file
+PATIENCE_S=${PATIENCE_S:-86400} # for a master that is not there; one of the same job ends with it
 LATE_S=30                      # before an old result counts: a run that is extended clears it
 STEADY_S=60                    # a worker that lived for so long starts with a clean record
 MAX_FAILURES=5                 # in a row
@@ -19,7 +18,6 @@ source "$PROJECT/slurm/lib.sh"
 
 export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 worker=
-leaving=
 
 leave() {
     leaving=1
@@ -59,9 +57,13 @@ while true; do
         say "the master has ended ($(ended_by)): the worker waits for the next one"
         continue
     fi
-    ((SECONDS - began < STEADY_S)) || failures=0
+    ((SECONDS - began < STEADY_S)) || failures=0 wait_s=1
+    if try_later "the worker"; then
+        continue
+    fi
+    [[ -z $leaving ]] || exit 0
     failures=$((failures + 1))
-    if ((status == USAGE_STATUS && SECONDS - began < STEADY_S)) || ((failures > MAX_FAILURES)); then
+    if ((status == USAGE_STATUS || failures > MAX_FAILURES)); then
         say "the worker ended with status $status: given up"
         exit "$status"
     fi

@@ -1,8 +1,11 @@
-"""Errors that a user can cause and mend.
+"""Errors that are told without a traceback.
 
-Command lines print them as one line and exit with status 2, so each message names the value,
-the bound and what to do.
+Command lines print them as one line, so each message names the value, the bound and what to do. The
+status says whose fault it was: 2 the user's, who must change something, 75 the environment's.
 """
+
+import os
+from errno import EADDRINUSE, EDQUOT, EIO, ENOMEM, ENOSPC, ESTALE
 
 # What reading a file raises that anybody may have written: it is missing, no JSON, or another one.
 UNREADABLE = (
@@ -14,6 +17,9 @@ UNREADABLE = (
     OverflowError,
     RecursionError,
 )
+USAGE_STATUS, UNAVAILABLE_STATUS = 2, os.EX_TEMPFAIL
+# A disk that is full or fails, no memory, a port that another process has.
+PASSING = (ENOSPC, EDQUOT, EIO, ESTALE, ENOMEM, EADDRINUSE)
 
 
 class TangramError(Exception):
@@ -22,6 +28,10 @@ class TangramError(Exception):
 
 class ConfigError(TangramError):
     """A setting that cannot work."""
+
+
+class UnavailableError(TangramError):
+    """What the environment lacks, and may have again by itself: it helps to try again later."""
 
 
 class SamplingError(TangramError):
@@ -34,3 +44,13 @@ class RunError(TangramError):
 
 class WireError(TangramError):
     """A message that breaks the protocol."""
+
+
+def is_passing(error: BaseException | None) -> bool:
+    """Whether an error, or the one that it was made of, is the environment's."""
+    while error is not None:
+        known = isinstance(error, UnavailableError | MemoryError)
+        if known or getattr(error, "errno", None) in PASSING:
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -1,5 +1,6 @@
 """Presets, overrides, help, and the entry of every command."""
 
+import errno
 import gc
 import shlex
 import sys
@@ -20,7 +21,7 @@ from conf.kinds import Kinds, kinds_of
 from conf.settings import PAGE, page
 from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.base.config import RelabelConfig
-from tangram_core.errors import ConfigError, TangramError
+from tangram_core.errors import ConfigError, RunError, TangramError, UnavailableError
 from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import KEY, PLAY, declared_fields
 from tangram_core.setup import Setup, from_mapping, make_setup
@@ -413,13 +414,17 @@ LOWER = "lower agent.replay_capacity, agent.batch_size or service.envs"
 @pytest.mark.parametrize(
     ("raised", "status", "line"),
     [
-        (TangramError("port 5 is taken"), 2, "port 5 is taken"),
-        (
-            OSError(28, "No space left on device", "/runs/x"),
-            2,
-            f"cannot use /runs/x (No space left on device): {ROOM}",
+        (TangramError("port 5 is too large"), 2, "port 5 is too large"),
+        (UnavailableError("port 5 is taken"), 75, "port 5 is taken"),
+        (MemoryError("4 GiB"), 75, f"not enough memory (4 GiB): {LOWER}"),
+        *(
+            (OSError(getattr(errno, name), "no", "/x"), status, f"cannot use /x (no): {ROOM}")
+            for status, names in {
+                75: ("ENOSPC", "EDQUOT", "EIO", "ESTALE", "ENOMEM", "EADDRINUSE"),
+                2: ("EACCES", "EROFS", "ENOENT", "EMFILE", "EADDRNOTAVAIL"),
+            }.items()
+            for name in names
         ),
-        (MemoryError("4 GiB"), 2, f"not enough memory (4 GiB): {LOWER}"),
     ],
 )
 def test_entry_turns_errors_into_a_line_and_a_status(
@@ -434,6 +439,22 @@ def test_entry_turns_errors_into_a_line_and_a_status(
 
     assert entered("eval run_dir=x", task)[0] == status
     assert capsys.readouterr() == ("", f"tangram-eval: {line}\n" if line else "")
+
+
+@pytest.mark.parametrize(("number", "status"), [(errno.ENOSPC, 75), (errno.EACCES, 2)])
+def test_an_error_that_was_made_of_another_has_the_status_of_that(
+    entered: Entered, number: int, status: int
+) -> None:
+    def task(settings: Plain) -> int:
+        try:
+            try:
+                raise OSError(number, "no")
+            except OSError:
+                raise RunError("cannot write") from None
+        except RunError as error:
+            raise ConfigError("it failed") from error
+
+    assert entered("eval run_dir=x", task)[0] == status
 
 
 def test_entry_does_not_hide_a_fault_of_ours(entered: Entered) -> None:

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import shlex
 import sys
 import tomllib
@@ -14,6 +15,7 @@ import pytest
 import yaml
 
 from conf.cli import composed
+from tangram_cli.commands import COMMANDS
 
 pytestmark = pytest.mark.fast
 
@@ -156,3 +158,19 @@ def test_ports_reach_this_machine_only() -> None:
 def test_a_master_has_time_for_its_checkpoint() -> None:
     assert COMPOSE["services"]["master"]["stop_grace_period"] == "120s"
     assert all(service["restart"] == "on-failure" for service in COMPOSE["services"].values())
+
+
+@pytest.mark.parametrize(("status", "told"), [(0, 0), (1, 1), (2, 0), (75, 75)])
+def test_wrong_settings_alone_end_a_container_for_good(
+    monkeypatch: pytest.MonkeyPatch, status: int, told: int
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["entry.py", "worker", "seed=1"])
+    monkeypatch.setitem(COMMANDS, "worker", lambda: status if sys.argv[1:] == ["seed=1"] else -1)
+    with pytest.raises(SystemExit) as caught:
+        runpy.run_path(str(DOCKER / "entry.py"), run_name="__main__")
+    assert caught.value.code == told
+    for service in COMPOSE["services"].values():
+        image = service["build"]["target"]
+        own = service["entrypoint"][:2] == ["python3", "/opt/tangram/entry.py"]
+        assert own == ("tensorboard" not in service["entrypoint"])
+        assert not own or image.startswith(service["entrypoint"][2])

@@ -171,9 +171,11 @@ class Registry:
             same.identity, same.last_seen = identity, now
             self._by_identity[identity] = same
             return same, None
-        if len(self._by_key) >= self._room.peers:
+        # One that takes an index over needs no more room: its predecessor leaves.
+        takes_over = (hello.role, hello.index) in self._by_key
+        if len(self._by_key) >= self._room.peers and not takes_over:
             reason = f"{self._room.peers} processes take part already, the most {self._room.bound}"
-            raise RefusedError("refused_full", Refused(reason))
+            raise RefusedError("refused_full", Refused(reason, later=True))
         stranger = self._by_identity.get(identity)
         if stranger is not None:
             self.leave(stranger)
@@ -281,7 +283,7 @@ class Registry:
             if own and key not in self._by_key and key not in reserved:
                 return index
         reason = f"all {MAX_INDEX + 1} indices of role {role} are taken"
-        raise RefusedError("refused_full", Refused(reason))
+        raise RefusedError("refused_full", Refused(reason, later=True))
 
     def _open_ledger(self, key: Key, hello: Hello, owner: str) -> Ledger:
         last = self._ledgers.get(key)

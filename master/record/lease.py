@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from tangram_core.errors import ConfigError, TangramError
+from tangram_core.errors import TangramError, UnavailableError
 from tangram_core.run.process import Every, still_alive
 
 RENEW_S = 10.0
@@ -36,7 +36,8 @@ class Lease:
         A disk that does not take it is told of, and no reason to stop.
 
         Raises:
-            ConfigError: a process of another machine works there.
+            UnavailableError: a process of another machine works there, perhaps of a job that was
+                queued again before this one had ended.
         """
         self._path, self._host, self._id = path, socket.gethostname(), secrets.token_hex(8)
         self._aside = path.with_name(f"{path.name}.{self._id}")
@@ -99,7 +100,7 @@ class Lease:
             time.sleep(LOOK_S)
             still_alive()
             if _fresh(self._path).st_mtime != first.st_mtime:
-                raise ConfigError(
+                raise UnavailableError(
                     f"run_dir {self._path.parent} is in use by a process on {host}: choose another "
                     "run_dir, or stop that one first"
                 )

@@ -17,7 +17,7 @@ import yaml
 from master.config import MasterConfig
 from master.record.journal import segments
 from master.record.lease import Lease, LostError
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError, RunError, TangramError, UnavailableError
 from tangram_core.run.code import code_of, own_code, read_code
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.run.outcome import bound_of, read_outcome
@@ -110,7 +110,7 @@ class RunFolder:
         return spent and result["scored_updates"] == result["updates"]
 
     def lock(self, name: str = LOCK) -> "Claim":
-        """Claim the folder for one process, until `close` or its end; ConfigError if it is used.
+        """Claim the folder for one process, until `close` or its end; TangramError if it is used.
 
         Args:
             name: `LOCK` for who writes the run, `LAUNCHER` for who starts its processes.
@@ -169,7 +169,7 @@ class Claim:
     """A run folder in which no other process works, as long as it is the one that was claimed."""
 
     def __init__(self, run: RunFolder, name: str = LOCK) -> None:
-        """Claim a folder; ConfigError if another process works there."""
+        """Claim a folder; TangramError if another process works there."""
         self.run, self._name = run, name
         self._take()
 
@@ -202,7 +202,7 @@ class Claim:
             self._take()
         except LostError as error:
             raise FolderError(f"run_dir {path} is lost: {error}") from None
-        except (OSError, ConfigError) as error:
+        except (OSError, TangramError) as error:
             why = error.strerror if isinstance(error, OSError) else "another process works there"
             raise FolderError(f"run_dir {path} cannot be claimed anew ({why})") from None
         self._release(*before)
@@ -232,7 +232,7 @@ class Claim:
                 f"{self.run.path / self._name} cannot be locked by flock ({error.strerror}): "
                 "choose a run_dir on a file system that has locks"
             ) from None
-        except ConfigError:
+        except UnavailableError:
             lock.close()
             raise
         # Open, so that no folder which is made later has the same number.

@@ -247,10 +247,16 @@ class Go(Message):
 
 @dataclass(frozen=True)
 class Refused(Message):
-    """The master does not take a process in."""
+    """The master does not take a process in.
+
+    Attributes:
+        reason: why.
+        later: it may, when others have left.
+    """
 
     kind: ClassVar[str] = "refused"
     reason: Reason
+    later: YesOrNo = False
 
 
 @dataclass(frozen=True)

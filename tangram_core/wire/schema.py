@@ -23,7 +23,7 @@ import msgpack
 from tangram_core.errors import WireError
 from tangram_core.wire.arrays import Column, decode_columns, encode_columns
 
-PROTOCOL = 8
+PROTOCOL = 9
 MAX_HEADER = 16 * 1024
 MAX_KIND = 32
 MAX_TEXT = 1024

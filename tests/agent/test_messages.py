@@ -109,7 +109,7 @@ BOUNDS: dict[str, dict[str, Bound]] = {
         "first_episode": Between(0, BIG),
         "episodes": Between(1, 4096),
     },
-    "refused": REASON,
+    "refused": {**REASON, "later": Flag()},
     "greet": {},
     "ack": {"sequence": Between(1, BIG), "duplicate": Flag()},
     "reject": {**REASON, "sequence": Between(0, BIG), "final": Flag()},

@@ -67,10 +67,10 @@ def run_here(command: str, *arguments: str, cwd: Path) -> str:
     return out
 
 
-def refused(command: str, *arguments: str, cwd: Path) -> str:
+def refused(command: str, *arguments: str, cwd: Path, wanted: int = 2) -> str:
     """Run a command that must refuse before it starts anything; the one line that it says."""
     status, out, err = here(command, *arguments, cwd=cwd)
-    assert (status, out) == (2, ""), out + err
+    assert (status, out) == (wanted, ""), out + err
     (line,) = err.splitlines()
     return line
 

@@ -247,7 +247,7 @@ def test_nothing_is_left_when_it_is_killed(running: Running, tmp_path: Path) -> 
         every = psutil.Process(one.process.pid).net_connections()
         heard = [found.laddr.ip for found in every if found.status == psutil.CONN_LISTEN]
         assert heard == ["127.0.0.1"]
-        line = refused("tangram-studio", f"port={one.port}", cwd=tmp_path)
+        line = refused("tangram-studio", f"port={one.port}", cwd=tmp_path, wanted=75)
         assert line == (
             f"tangram-studio: cannot listen on 127.0.0.1, port {one.port} (Address already in "
             "use): choose another with port=8766, or any free one with port=0"

@@ -93,6 +93,26 @@ def test_restarts_come_later_and_later_and_end(
             assert made.next_start_s == 1000.0 + 0.5 * 2 ** (restarts - 1)
 
 
+@pytest.mark.fast
+def test_what_the_environment_lacks_is_waited_for_longer_and_longer_without_an_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(children_module.time, "monotonic", lambda: 1000.0)
+    made = Child("worker", [])
+    made._started_s, waits = 999.0, list[float]()
+    for _ in range(2000):
+        assert made.plan_restart(75)
+        waits.append(made.next_start_s - 1000.0)
+    assert waits[:12] == [0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256, 300, 300]
+    assert (set(waits[12:]), made.plan, made.restarts) == ({300.0}, "in 300 s", 0)
+    made._started_s = 940.0  # it had all it needs
+    assert made.plan_restart(75)
+    assert made.plan == "in 0.5 s"
+    made._started_s = 999.0
+    assert made.plan_restart(1)
+    assert (made.plan, made.restarts) == (f"1 of {MAX_RESTARTS}", 1)
+
+
 @pytest.mark.cluster
 def test_a_child_has_its_own_session_niceness_thread_and_log(
     tmp_path: Path,

@@ -1,11 +1,13 @@
 """The server that forks children: what may happen to it."""
 
+import errno
 import os
 import signal
 import time
 from collections.abc import Iterator
 from multiprocessing import forkserver
 from queue import SimpleQueue
+from unittest import mock
 
 import psutil
 import pytest
@@ -13,7 +15,7 @@ import pytest
 from master.children import Child
 from master.forking import warm_up
 from master.signals import SIGNALS
-from tangram_core.errors import TangramError
+from tangram_core.errors import TangramError, UnavailableError
 from tests.bodies import run_code
 
 pytestmark = pytest.mark.cluster
@@ -70,6 +72,25 @@ def test_a_server_that_cannot_start_is_told_with_a_remedy(monkeypatch: pytest.Mo
     told = r"no process can be started \(AF_UNIX path too long\): is TMPDIR, or /tmp, a short path"
     with pytest.raises(TangramError, match=told):
         waiting(SimpleQueue())
+
+
+@pytest.mark.parametrize(
+    ("error", "later"),
+    [
+        (EOFError(), True),
+        (ConnectionResetError(), True),
+        (OSError(errno.EAGAIN, "no process"), True),
+        (OSError(errno.ENOMEM, "no memory"), True),
+        (OSError(errno.EACCES, "not yours"), False),
+    ],
+)
+def test_a_start_that_may_work_later_is_told_apart(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, later: bool
+) -> None:
+    monkeypatch.setattr(forkserver, "ensure_running", mock.Mock(side_effect=error))
+    with pytest.raises(TangramError, match="no process can be started") as caught:
+        waiting(SimpleQueue())
+    assert isinstance(caught.value, UnavailableError) == later
 
 
 def test_children_outlive_a_killed_server_and_others_can_be_started() -> None:

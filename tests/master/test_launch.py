@@ -17,7 +17,7 @@ from master.config import MasterConfig
 from master.launch import Launcher, master_arguments, run_training
 from master.record.rundir import RunFolder
 from master.watch.console import logging_to, sturdy_console
-from tangram_core.errors import ConfigError
+from tangram_core.errors import ConfigError, UnavailableError
 from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import from_mapping
 from tests.bodies import run_code
@@ -220,6 +220,104 @@ def test_everything_ends_with_the_master(
         f"the master ended with {said}; the same command with resume=auto goes on from what it kept"
     )
     assert told.splitlines() == (expected if said else [])
+
+
+@pytest.mark.cluster
+def test_a_master_that_lacks_something_is_started_again_however_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children_module, "MAX_WAIT_S", 0.02)
+    times = MAX_RESTARTS + 1
+    ending = f"""
+lives = len(list(folder.glob("life*")))
+(folder / f"life {{lives}}").touch()
+if lives < {times}:
+    sys.exit(75)
+end()"""
+    made = launcher(tmp_path, ending, condition="False")
+    made._evaluator.next_start_s = None
+    status, told = finish(made, tmp_path)
+    assert status == 0
+    waits = [0.01, *[0.02] * (times - 1)]
+    assert told.splitlines() == [
+        f"the master ended with status 75: it goes on from what it left (in {wait:g} s)"
+        for wait in waits
+    ]
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize("status", [75, 1])
+def test_a_signal_ends_a_master_that_waits_for_its_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int
+) -> None:
+    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 1000.0)
+    monkeypatch.setattr(children_module, "MAX_WAIT_S", 1000.0)
+    monkeypatch.setattr(children_module, "MAX_DELAY_S", 1000.0)
+    made = launcher(tmp_path, f"sys.exit({status})", condition="False")
+
+    def waits() -> bool:
+        return made._master.next_start_s is not None and made._master.next_start_s > 0.0
+
+    signalled(made, signal.SIGINT, waits, monkeypatch)
+    result, told = finish(made, tmp_path)
+    assert result == 128 + signal.SIGINT
+    assert told.splitlines()[-1] == (
+        "Ctrl-C (SIGINT): the run ends; the same command with resume=auto goes on from what it kept"
+    )
+
+
+@pytest.mark.cluster
+def test_a_process_that_cannot_be_started_now_is_started_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, failed = Child.start, list[str]()
+
+    def starts(child: Child, ended: Callable[[Child], None]) -> None:
+        if child.name not in failed:
+            failed.append(child.name)
+            child.next_start_s = None
+            raise UnavailableError("no memory")
+        start(child, ended)
+
+    monkeypatch.setattr(Child, "start", starts)
+    made = launcher(tmp_path, condition=logs("worker-0"), players=[WORKER])
+    made._evaluator.next_start_s = None
+    status, told = finish(made, tmp_path)
+    assert status == 0
+    assert told.splitlines() == [
+        f"{name}: no memory (tried again in 0.01 s)" for name in ("worker 0", "master")
+    ]
+
+
+@pytest.mark.cluster
+def test_a_worker_that_lacks_something_is_told_with_what(tmp_path: Path) -> None:
+    player = f"""
+from pathlib import Path
+first = Path({str(tmp_path / "first")!r})
+if not first.exists():
+    first.touch()
+    print("the room is full", flush=True)
+    raise SystemExit(75)
+Path({str(tmp_path / "came_back")!r}).touch()
+{WORKER}"""
+    waits = f"not Path({str(tmp_path / 'came_back')!r}).exists()"
+    made = launcher(tmp_path, condition=waits, players=[player])
+    status, told = finish(made, tmp_path)
+    assert (status, made._players[0].restarts) == (0, 0)
+    assert told.splitlines() == [
+        "worker 0 ended with status 75: it is started again (in 0.01 s); "
+        f"see {tmp_path}/logs/worker-0.log",
+        "the room is full",
+    ]
+
+
+@pytest.mark.cluster
+def test_when_no_worker_is_left_a_master_that_waits_is_not_waited_for(tmp_path: Path) -> None:
+    made = launcher(tmp_path, players=["raise SystemExit(2)"])
+    (tmp_path / "news").touch()
+    (tmp_path / "connection.json").touch()
+    made._master.next_start_s = time.monotonic() + 1000.0
+    assert finish(made, tmp_path)[0] == 1
 
 
 @pytest.mark.cluster

@@ -20,7 +20,7 @@ from master.record.journal import segments
 from master.record.rundir import Record, RunFolder
 from master.run import UNBOUNDED, open_run
 from master.signals import StopSignals
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError, RunError, is_passing
 from tangram_core.run.process import Every, Watchdog
 from tangram_core.run.service import ServiceConfig
 from tangram_core.wire.messages import OPEN
@@ -175,10 +175,11 @@ def test_the_ports_can_be_fixed_and_a_taken_one_is_named(tmp_path: Path) -> None
         for taken, asked in ((port, port), (port, port - 1)):
             remedy = rf"port {taken} of .* is in use: choose another with service\.port="
             with (
-                pytest.raises(ConfigError, match=remedy),
+                pytest.raises(ConfigError, match=remedy) as caught,
                 opened_run(tmp_path / str(asked), bind="127.0.0.1", port=asked),
             ):
                 pass
+            assert is_passing(caught.value)
 
 
 def test_a_run_that_is_open_to_all_says_so(tmp_path: Path, told: Told) -> None:

@@ -1,5 +1,6 @@
 """The job scripts as texts: what can be seen without SLURM."""
 
+import os
 import re
 import subprocess
 from collections.abc import Iterator
@@ -108,3 +109,55 @@ def test_the_image_takes_every_package_along() -> None:
     packages = {path.parent.name for path in FOLDER.parent.glob("*/__init__.py")} - {"tests"}
     assert {"conf", "master", "tangram_cli", "worker"} < packages <= set(sources)
     assert all((FOLDER.parent / source).exists() for source in sources)
+
+
+# Stands for a command: a line of what it was told, and the next status of a list.
+STAND_IN = """#!/bin/bash
+echo "$*" >>"$RUN_DIR/told"
+read -r status <"$RUN_DIR/statuses"
+sed -i 1d "$RUN_DIR/statuses"
+exit "$status"
+"""
+
+
+def end_of(
+    folder: Path, role: str, statuses: list[int], sleep: str = ":"
+) -> tuple[int, list[str], list[str]]:
+    """Run a script whose commands end like this: its status, its waits, and what they were told."""
+    commands, run_dir = folder / ".venv" / "bin", folder / "run"
+    commands.mkdir(parents=True)
+    run_dir.mkdir()
+    (folder / "slurm").symlink_to(FOLDER)
+    for name, text in ((f"tangram-{role}", STAND_IN), ("sleep", f"#!/bin/sh\n{sleep}\n")):
+        (commands / name).write_text(text)
+        (commands / name).chmod(0o755)
+    (run_dir / "connection.json").touch()
+    (run_dir / "statuses").write_text("".join(f"{status}\n" for status in statuses))
+    given = {"PROJECT": str(folder), "RUN_DIR": str(run_dir), "RUN_WITH": ""}
+    command, env = [str(FOLDER / f"{role}.sh"), "seed=1"], os.environ | given
+    done = subprocess.run(command, check=False, env=env, capture_output=True, text=True)
+    waits = re.findall(r"is started again in (\d+) s$", done.stdout, re.MULTILINE)
+    return done.returncode, waits, (run_dir / "told").read_text().splitlines()
+
+
+@pytest.mark.parametrize("role", ["master", "worker"])
+@pytest.mark.parametrize(
+    ("statuses", "waits"),
+    [
+        ([75] * 9 + [0], ["2", "4", "8", "16", "32", "64", "128", "256", "300"]),
+        ([75, 2], ["2"]),
+        ([2], []),
+    ],
+)
+def test_what_the_environment_lacks_is_waited_for_and_wrong_settings_are_not(
+    tmp_path: Path, role: str, statuses: list[int], waits: list[str]
+) -> None:
+    status, waited, told = end_of(tmp_path, role, statuses)
+    assert (status, waited) == (statuses[-1], waits)
+    assert [line.rpartition(" ")[2] for line in told] == ["seed=1"] * len(statuses)
+
+
+@pytest.mark.parametrize(("role", "last"), [("master", 75), ("worker", 0)])
+def test_a_time_limit_ends_who_waits(tmp_path: Path, role: str, last: int) -> None:
+    status, waited, told = end_of(tmp_path, role, [75, 75, 75, 3], "kill -USR1 $PPID")
+    assert (status, waited, len(told)) == (last, ["2"], 1)

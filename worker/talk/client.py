@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Self
 
 from tangram_core.agent import Weights
-from tangram_core.errors import TangramError, WireError
+from tangram_core.errors import TangramError, UnavailableError, WireError
 from tangram_core.spec import Episodes, EpisodeSpec
 from tangram_core.wire.addresses import host_of, reachable
 from tangram_core.wire.arrays import WeightShapes
@@ -157,7 +157,7 @@ class Client:
         )
         joined = self._wait(lambda: self.joined, "the master", self._timing.join_s)
         if not joined and not self.stopped:
-            raise TangramError(self._connection.no_master(self._timing.join_s))
+            raise self._connection.no_master(self._timing.join_s)
         return joined
 
     def poll(self, timeout_s: float = 0.0) -> None:
@@ -370,8 +370,9 @@ class Client:
                     self.joined, self._hello_at = False, now
             case Stop(reason):
                 self._dismissed, self._dismissal = True, reason
-            case Refused(reason):
-                raise TangramError(
+            case Refused(reason, later):
+                kind = UnavailableError if later else TangramError
+                raise kind(
                     f"the master at {self._connection.place} refused this {self._role}: {reason}"
                 )
 

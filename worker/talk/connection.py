@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from tangram_core.errors import RunError, TangramError
+from tangram_core.errors import RunError, TangramError, UnavailableError
 from tangram_core.wire.addresses import KEEPALIVE
 from tangram_core.wire.arrays import MAX_WEIGHTS_BYTES
 from tangram_core.wire.schema import MAX_HEADER
@@ -235,15 +235,16 @@ class Connection:
             return f"an answer of the master at {self.place}"
         return ""
 
-    def no_master(self, patience_s: float) -> str:
+    def no_master(self, patience_s: float) -> TangramError:
         """The error that no master could be joined for this long, for the user."""
         if self.keys_refused:
-            return keys_error(self._connect, self.place)
+            return TangramError(keys_error(self._connect, self.place))
         if self.address is None:
-            return no_file_error(self.place, patience_s)
+            return UnavailableError(no_file_error(self.place, patience_s))
         if self._unknown_host:
-            return f"no master was found in {patience_s:g} s: {self._unknown_host}"
-        return (
+            told = f"no master was found in {patience_s:g} s: {self._unknown_host}"
+            return UnavailableError(told)
+        return UnavailableError(
             f"no master answers at {self.place} after {patience_s:g} s: is tangram-master running "
             "there?"
         )
@@ -324,9 +325,9 @@ class Connection:
             self._reopen_at = now
 
     def check_lost(self, now: float) -> None:
-        """Raise TangramError if no connection brought an answer for too long."""
+        """Raise UnavailableError if no connection brought an answer for too long."""
         if self._lost_at is not None and now - self._lost_at > self._timing.lost_s:
-            raise TangramError(
+            raise UnavailableError(
                 f"the master at {self.place} has not answered for {self._timing.lost_s:g} s: "
                 "is it still running?"
             )

@@ -12,7 +12,7 @@ from typing import Any
 
 from zmq.utils import z85
 
-from tangram_core.errors import UNREADABLE, RunError
+from tangram_core.errors import UNREADABLE, RunError, UnavailableError
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.store.files import check_own
 from tangram_core.wire.addresses import IPC, dns_error
@@ -108,13 +108,14 @@ def await_master(
     """The master's address, also when its file is written later; `tell` takes a line for the user.
 
     Raises:
-        RunError: neither an address nor a readable connection file, or none in time.
+        RunError: neither an address nor a readable connection file.
+        UnavailableError: none in time.
     """
     until_s = time.monotonic() + patience_s
     told = False
     while (found := find_master(connect)) is None:
         if time.monotonic() >= until_s:
-            raise RunError(no_file_error(connect, patience_s))
+            raise UnavailableError(no_file_error(connect, patience_s))
         if not told:
             ended = (Path(connect) / RESULT).is_file()
             note = f"run {Path(connect).name} has ended, unless its master goes on with it: "

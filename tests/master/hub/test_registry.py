@@ -8,6 +8,7 @@ import pytest
 from master.hub.gate import DESCRIPTORS, HANDSHAKES, RESERVE, Room
 from master.hub.registry import Peer, RefusedError, Registry
 from tangram_core.errors import RunError
+from tangram_core.wire.messages import Refused
 from tangram_core.wire.schema import MAX_COUNT
 from tests.agent.messages import FINGERPRINTS, hello
 
@@ -149,8 +150,10 @@ def test_an_incarnation_that_was_never_given_becomes_the_next(
 def test_incarnations_end_where_messages_could_not_tell_them(registry: Registry) -> None:
     registry.load_state({"player/0": {"incarnation": MAX_COUNT - 1, "sequence": 0}}, -GRACE_S)
     assert admitted(registry, "b", index=0).incarnation == MAX_COUNT
-    with pytest.raises(RefusedError, match="player 0 has no incarnation left: start with another"):
+    none_left = "player 0 has no incarnation left: start with another"
+    with pytest.raises(RefusedError, match=none_left) as caught:
         admitted(registry, "c", index=0)
+    assert caught.value.answer == Refused(str(caught.value), later=False)
     assert admitted(registry, "c").incarnation == 1
 
 
@@ -187,8 +190,30 @@ def test_the_last_tenth_of_the_room_is_told_once(caplog: pytest.LogCaptureFixtur
     assert told == [0] * 8 + [1, 1]
     bound = f"{files} open files allow: raise ulimit -n and start the master again"
     assert caplog.messages == [f"9 processes take part, of at most 10 that {bound}"]
-    with pytest.raises(RefusedError, match=f"10 .* already, the most that {bound}"):
+    with pytest.raises(RefusedError, match=f"10 .* already, the most that {bound}") as caught:
         admitted(registry, "k")
+    assert caught.value.answer == Refused(str(caught.value), later=True)
+
+
+def test_a_full_room_lets_the_successor_of_a_process_in(registry: Registry) -> None:
+    """The dead one is not known to be dead yet."""
+    full = Registry(FINGERPRINTS, GRACE_S, Room(RESERVE + HANDSHAKES + 2 * DESCRIPTORS))
+    dead, other = admitted(full, "a"), admitted(full, "b")
+    successor, older = full.admit(b"c", hello(process="c", index=0), 1.0)
+    assert (older, successor.incarnation, full.peers) == (dead, 2, [successor, other])
+    for more in ({"index": 2}, {"index": 0, "role": "evaluator"}):  # theirs would be one more
+        with pytest.raises(RefusedError, match="2 processes take part already"):
+            admitted(full, "d", **more)
+
+
+def test_who_finds_all_indices_taken_may_come_later(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("master.hub.registry.MAX_INDEX", 0)
+    admitted(registry, "a")
+    with pytest.raises(RefusedError, match="all 1 indices of role player are taken") as caught:
+        admitted(registry, "b")
+    assert caught.value.answer == Refused(str(caught.value), later=True)
 
 
 def test_batches_of_the_journal_are_new_once(registry: Registry) -> None:
@@ -250,8 +275,9 @@ def test_an_index_stays_with_the_key_that_had_it_first(registry: Registry, kept:
     assert registry.state() == {"player/0": entry}
     stolen = {"index": 0, "incarnation": 1, "process": "hers", "first": 1000}
     for claim in (stolen, stolen | {"incarnation": 9}, {"index": 0, "process": "mine"}):
-        with pytest.raises(RefusedError, match="player 0 .* another key: leave index out"):
+        with pytest.raises(RefusedError, match="player 0 .* another key: leave index out") as told:
             registry.admit(b"mallory", hello(**claim), 1.0, "mallory")
+        assert told.value.answer == Refused(str(told.value), later=False)
     later = 2.0 * GRACE_S
     for owner in ("mallory", "player"):  # the lowest that is free is none of hers
         peer, _ = registry.admit(owner.encode(), hello(process=owner), later, owner)

@@ -7,6 +7,8 @@ import os
 import socket
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ import pytest
 from master.record import lease as lease_module
 from master.record.lease import Lease
 from master.record.rundir import LEASE, FolderError, RunFolder
-from tangram_core.errors import ConfigError
+from tangram_core.errors import ConfigError, UnavailableError
 
 pytestmark = pytest.mark.fast
 
@@ -33,8 +35,9 @@ def of_another(folder: Path, age_s: float = 0.0, host: str = "far") -> Path:
     return path
 
 
-def test_a_process_of_another_machine_that_lives_keeps_its_folder(tmp_path: Path) -> None:
-    path, over = of_another(tmp_path), threading.Event()
+@contextmanager
+def living(path: Path) -> Iterator[None]:
+    over = threading.Event()
 
     def live() -> None:
         while not over.wait(0.05):
@@ -43,13 +46,24 @@ def test_a_process_of_another_machine_that_lives_keeps_its_folder(tmp_path: Path
     thread = threading.Thread(target=live)
     thread.start()
     try:
-        with pytest.raises(ConfigError, match="is in use by a process on far: choose another"):
-            RunFolder(tmp_path).lock()
+        yield
     finally:
         over.set()
         thread.join()
-    with RunFolder(tmp_path).lock():  # which the one that was refused did not keep
+
+
+def test_a_process_of_another_machine_that_lives_keeps_its_folder(tmp_path: Path) -> None:
+    """Perhaps for no more than the moment in which its job ends, after it was queued again."""
+    path = of_another(tmp_path)
+    with living(path), pytest.raises(UnavailableError, match="by a process on far: choose another"):
+        RunFolder(tmp_path).lock()
+    with RunFolder(tmp_path).lock() as claim:  # which the one that was refused did not keep
         assert json.loads(path.read_text())["id"] != "theirs"
+        claim.run.path.joinpath(".lock").unlink()
+        of_another(tmp_path)
+        told = r"cannot be claimed anew \(another process works there\)"
+        with living(path), pytest.raises(FolderError, match=told):
+            claim.check()
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from master.watch import health as health_module
 from master.watch.health import Health
-from tangram_core.errors import ConfigError
+from tangram_core.errors import ConfigError, is_passing
 from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus
 
 pytestmark = pytest.mark.cluster
@@ -153,5 +153,8 @@ def test_requests_that_are_reset_are_one_line(
 
 def test_a_port_that_is_taken_is_told(health: Health) -> None:
     port = port_of(health)
-    with pytest.raises(ConfigError, match=rf"port {port} \(.*service\.http_port=-1 for none"):
+    with pytest.raises(
+        ConfigError, match=rf"port {port} \(.*service\.http_port=-1 for none"
+    ) as told:
         Health("127.0.0.1", port)
+    assert is_passing(told.value)

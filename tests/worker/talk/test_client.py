@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from master.record.delivery import ScoresArrived
-from tangram_core.errors import RunError, TangramError, WireError
+from tangram_core.errors import RunError, TangramError, UnavailableError, WireError
 from tangram_core.wire.messages import (
     Ack,
     Alive,
@@ -69,29 +69,31 @@ def test_no_master_in_time_says_where_none_is(tmp_path: Path, what: str) -> None
         ),
     }[what]
     with make_client(connect, replace(QUICK, join_s=0.2)) as client:
-        with pytest.raises(TangramError) as caught:
+        with pytest.raises(UnavailableError) as caught:
             client.join()
         assert str(caught.value) == f"{nobody}: is tangram-master running there?"
 
 
 @pytest.mark.parametrize(
-    ("answer", "reason"),
+    ("answer", "reason", "later"),
     [
-        (Refused("its settings of net differ"), "refused this player: its settings of net differ"),
-        (with_header(Greet().encode(), v=99), "speaks protocol 99, this one .*: install the same"),
+        (Refused("its settings of net differ"), "refused this player: its settings of net", False),
+        (Refused("100 take part", later=True), "refused this player: 100 take part", True),
+        (with_header(Greet().encode(), v=99), "speaks protocol 99, .*: install the same", False),
     ],
 )
 @pytest.mark.parametrize("before", [True, False])
 def test_a_master_that_does_not_fit_ends_a_worker(
-    master: StandIn, answer: Refused | list[bytes], reason: str, before: bool
+    master: StandIn, answer: Refused | list[bytes], reason: str, later: bool, before: bool
 ) -> None:
     with make_client(master.endpoint) as client:
         master.until(client, lambda: master.heard)
         if before:  # it had been welcomed
             master.welcome(client)
         master.say(answer)
-        with pytest.raises(TangramError, match=reason):
+        with pytest.raises(TangramError, match=reason) as caught:
             master.until(client, lambda: False)
+        assert isinstance(caught.value, UnavailableError) == later
 
 
 def test_a_master_of_another_run_gets_nothing(master: StandIn, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import zmq
 
-from tangram_core.errors import TangramError
+from tangram_core.errors import TangramError, UnavailableError
 from tangram_core.wire.addresses import KEEPALIVE
 from tangram_core.wire.messages import Alive, Greet, Hello
 from tests.agent.messages import SHAPES, episodes, weights
@@ -92,7 +92,7 @@ def test_connections_that_died_without_a_word_are_found_without_pings(master: St
 
 def test_a_lost_master_is_given_up_in_the_end(master: StandIn) -> None:
     with welcomed(master, replace(QUICK, silence_s=0.1, lost_s=0.3)) as client:
-        with pytest.raises(TangramError) as caught:
+        with pytest.raises(UnavailableError) as caught:
             master.until(client, lambda: False)
         assert str(caught.value) == (
             f"the master at {master.endpoint} has not answered for 0.3 s: is it still running?"
@@ -172,8 +172,9 @@ def test_a_host_that_dns_does_not_know_is_told_once_and_looked_up_again(
         while answers:
             assert time.monotonic() < deadline
             client.poll(0.01)
-            told = client._connection.no_master(1.0)
-            assert ("in 1 s: no such host" in told) == bool(answers)
+            error = client._connection.no_master(1.0)
+            assert ("in 1 s: no such host" in str(error)) == bool(answers)
+            assert isinstance(error, UnavailableError)
     assert caplog.messages.count("no such host") == 1
 
 

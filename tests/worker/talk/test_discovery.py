@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tangram_core.errors import RunError
+from tangram_core.errors import RunError, UnavailableError
 from tangram_core.wire.addresses import dns_error
 from worker.talk.discovery import MasterAddress, await_master, find_master, host_error
 
@@ -174,14 +174,14 @@ def test_a_file_that_comes_late_is_waited_for(tmp_path: Path) -> None:
     assert await_master(str(path), tell, 60.0) == MasterAddress("tcp://h:1", "r")
     assert told == [f"waits for the connection file {path}, for 60 s at most"]
     path.unlink()
-    with pytest.raises(RunError, match=r"no connection file is at .*c.json after 0.1 s"):
+    with pytest.raises(UnavailableError, match=r"no connection file is at .*c.json after 0.1 s"):
         await_master(str(path), lambda _: None, 0.1)
 
 
 def test_a_run_that_has_ended_is_told_before_it_is_waited_for(tmp_path: Path) -> None:
     (tmp_path / "result.json").touch()
     told: list[str] = []
-    with pytest.raises(RunError, match="no connection file is at"):
+    with pytest.raises(UnavailableError, match="no connection file is at"):
         await_master(str(tmp_path), told.append, 0.1)
     assert told == [
         f"run {tmp_path.name} has ended, unless its master goes on with it: waits for the "
@@ -208,6 +208,8 @@ def test_who_reads_a_file_makes_no_folder(tmp_path: Path, place: str) -> None:
             find_master(str(path))
     else:
         assert find_master(str(path)) is None
-        with pytest.raises(RunError, match="or none whose sockets are there: is tangram-master"):
+        with pytest.raises(
+            UnavailableError, match="or none whose sockets are there: is tangram-master"
+        ):
             await_master(str(path), lambda _: None, 0.1)
     assert not (tmp_path / "x").exists()

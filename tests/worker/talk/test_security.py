@@ -22,7 +22,7 @@ from master.loop import Loop
 from master.record.audit import Audit
 from master.record.rundir import RunFolder
 from tangram_core.agent import Weights
-from tangram_core.errors import RunError, TangramError
+from tangram_core.errors import RunError, TangramError, UnavailableError
 from tangram_core.wire.messages import (
     PICTURE_WIDTH,
     Greet,
@@ -79,6 +79,7 @@ def turned_away(stage: Stage, connect: object) -> str:
         both(stage, client, lambda: client.counters["handshakes_failed"] >= 2)
         with pytest.raises(TangramError) as caught:
             served(stage, client.join)
+    assert not isinstance(caught.value, UnavailableError)  # another file helps, and no waiting
     return str(caught.value)
 
 
