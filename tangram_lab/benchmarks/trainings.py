@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -46,6 +47,12 @@ def start_training(folder: Path, *settings: str, name: str = "train") -> "subpro
         )
     lifeline.started()
     return process
+
+
+def free_port() -> int:
+    """One that nobody listens on, and whose next one is free most often."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
 
 
 def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from tangram_core.errors import TangramError
 from tangram_lab.benchmarks.measure import show, write
-from tangram_lab.benchmarks.trainings import LOOK_S, numbers_of, result_of
+from tangram_lab.benchmarks.trainings import LOOK_S, free_port, numbers_of, result_of
 from tangram_lab.benchmarks.trials.attacks import BESIEGED, LIVE, OPEN_FILES
 from tangram_lab.benchmarks.trials.harms import harmed
+from tangram_lab.benchmarks.trials.neighbours import NEIGHBOURS
 from tangram_lab.benchmarks.trials.target import (
     OFTEN,
     OURS,
@@ -24,7 +25,7 @@ from tangram_lab.benchmarks.trials.target import (
     tried,
 )
 
-ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")
+ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")  # and on the same ever after
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
 UPDATES = 200  # before the attacks begin
 
@@ -69,13 +70,14 @@ def run_attack(out: Path | None, folder: Path) -> int:
     live, straight = folder / "live", folder / "straight"
     with beside() as pool, ExitStack() as others:
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
-        with training(live, "max_updates=0", *ON_A_PORT, *OURS, OFTEN) as target:
+        port = f"service.port={free_port()}"
+        with training(live, "max_updates=0", *ON_A_PORT, port, *OURS, OFTEN) as target:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
             target.goes_on(UPDATES, "updates")
             rows = list(tried(BESIEGED, target))
             meanwhile = pool.submit(harmed, folder)
             undisturbed = others.enter_context(started(straight, "max_updates=0", *OURS))
-            rows += tried(LIVE, target)
+            rows += tried((*NEIGHBOURS, *LIVE), target)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         result = result_of(live)
         rows += meanwhile.result()

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 
 import numpy as np
 import psutil
@@ -331,6 +332,28 @@ def slow_requests(target: Target) -> Seen:
     return held, f"{more} threads more; then {answer[:15]!r}"
 
 
+def asked(target: Target, words: bytes) -> Seen:
+    """What HTTP answers to something else than a question that it knows."""
+    with socket.create_connection(target.port("http"), 10.0) as one:
+        with suppress(OSError):  # it may hang up before it has heard all
+            one.sendall(words)
+            one.shutdown(socket.SHUT_WR)
+        answer = b""
+        with suppress(OSError):
+            while part := one.recv(4096):
+                answer += part
+    told = b" 200 " in answer or b"key" in answer
+    return not told and target.goes_on(), f"answered: {answer[:30]!r}"
+
+
+ODD = {
+    "a way out": b"GET /../keys.json HTTP/1.0\r\n\r\n",
+    "another method": b"DELETE /metrics HTTP/1.0\r\n\r\n",
+    "a line of a megabyte": b"GET /" + b"x" * MIB + b" HTTP/1.0\r\n\r\n",
+    "10,000 headers": b"GET /metrics HTTP/1.0\r\n" + b"x: y\r\n" * 10_000 + b"\r\n",
+}
+
+
 # First: what others leave behind would be room for it. And with nothing else at work: a worker
 # joins in the time that strangers leave to the master.
 BESIEGED: list[Attack] = [
@@ -352,6 +375,7 @@ LIVE: list[Attack] = [  # the largest one is the last
     ("held", "forged headers and messages", "5,000", forged_messages),
     ("held", "subscribers that never read", "20", deaf_subscribers),
     ("held", "slow HTTP clients", "600", slow_requests),
+    *(("held", f"HTTP with {what}", "1", partial(asked, words=ODD[what])) for what in ODD),
     ("held", "texts that are no UTF-8", "3 messages", invalid_utf8),
     ("held", "degenerate batches", "19", degenerate_batches),
     ("held", "a message of many frames", "1,000,000", million_frames),

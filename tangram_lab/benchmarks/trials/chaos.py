@@ -26,6 +26,7 @@ from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import (
     LOOK_S,
+    free_port,
     processes_of,
     result_of,
     start_training,
@@ -291,8 +292,7 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
         0 if the run recovered from every fault and nothing was lost, doubled or left, else 1.
     """
     disturbed, straight = folder / "disturbed", folder / "straight"
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = int(probe.getsockname()[1])
+    port = free_port()
     bounds = (f"seed={seed}", *TCP, f"service.port={port}", "max_updates=0", *SETTINGS)
     launcher = start_training(disturbed, *bounds)
     wait_for(disturbed / "connection.json", launcher)

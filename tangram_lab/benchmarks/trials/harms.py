@@ -2,19 +2,18 @@
 
 import os
 import time
-from contextlib import suppress
 from pathlib import Path
 from threading import Timer
 
 import psutil
 
 from master.record.journal import segments
-from tangram_core.errors import TangramError
 from tangram_core.run.code import override
 from tangram_core.wire.messages import EpisodeBatch
 from tangram_core.wire.schema import MAX_COUNT
-from tangram_lab.benchmarks.trials.chaos import Witness, compare
+from tangram_lab.benchmarks.trials.chaos import WORKERS, Witness, compare
 from tangram_lab.benchmarks.trials.intruder import NOBODY, knock
+from tangram_lab.benchmarks.trials.starts import STARTS
 from tangram_lab.benchmarks.trials.target import (
     ENDS_S,
     OFTEN,
@@ -27,10 +26,14 @@ from tangram_lab.benchmarks.trials.target import (
     one_line,
     training,
     tried,
+    until,
 )
 from worker.talk.client import Client
 
 LEARNS_LITTLE = "agent.updates_per_transition=0.1"  # nobody asks for its score
+SILENCE = "service.silence_seconds=6"
+BUSY_PERCENT = 20.0  # of a core: between scores it sleeps
+ODD_NAME = "a=run of \"ü'\\"
 
 
 def sockets_of_others(target: Target) -> Seen:
@@ -54,13 +57,7 @@ def killed(target: Target) -> bool:
     target.goes_on(20.0)
     master = target.master
     master.kill()
-    until_s = time.monotonic() + ENDS_S
-    while time.monotonic() < until_s:
-        with suppress(TangramError, psutil.Error):
-            if target.master.pid != master.pid and target.goes_on(10.0):
-                return True
-        time.sleep(0.2)
-    return False
+    return until(lambda: target.master.pid != master.pid and target.goes_on(10.0))
 
 
 def killed_after_huge_numbers(target: Target) -> Seen:
@@ -121,6 +118,25 @@ def frozen(target: Target) -> Seen:
     return held, "it goes on" if held else "it does not go on"
 
 
+def asleep(target: Target) -> Seen:
+    """A laptop's lid: the worker was forgotten, and comes back."""
+    worker = target.process("role=player")
+    worker.suspend()
+    fewer = until(lambda: target.numbers()["players"] < WORKERS + 1)
+    worker.resume()
+    held = until(lambda: target.numbers()["players"] == WORKERS + 1)
+    return fewer and held, f"forgotten: {fewer}; takes part again: {held}"
+
+
+def without_evaluator(target: Target) -> Seen:
+    """It is killed in the middle of a score."""
+    one = target.process("role=evaluator")
+    until(lambda: one.cpu_percent(0.5) > BUSY_PERCENT)
+    one.kill()
+    held = target.goes_on(2.0, "hub/scores")
+    return held, f"scores go on: {held}"
+
+
 OWN: list[Attack] = [
     ("5", "another user at the sockets", "1", sockets_of_others),
     ("held", "two masters on one folder", "1", second_master),
@@ -129,6 +145,8 @@ OWN: list[Attack] = [
     ("8", "the run folder taken away", "3 s", folder_away),
     ("held", "a full disk", "until it stands", full_disk),
     ("held", "SIGSTOP", "8 s", frozen),
+    ("held", "a worker that sleeps until it is forgotten", "1", asleep),
+    ("held", "the evaluator killed in mid-score", "1", without_evaluator),
 ]
 
 
@@ -153,7 +171,7 @@ LOCKSTEP: list[Attack] = [("6", "another batch than was ordered", "1", wrong_bat
 
 def harmed(folder: Path) -> Rows:
     """What was done to trainings in a folder that harm nobody else, as rows."""
-    rows = witnessed(folder / "a=run of ü")
+    rows = [*witnessed(folder / ODD_NAME), *tried(STARTS, folder)]
     lockstep = ("service.mode=lockstep", "workers=1", "max_updates=0", "sim=kinematic")
     with training(folder / "lockstep", *lockstep, name="master") as target:
         return [*rows, *tried(LOCKSTEP, target)]
@@ -161,7 +179,7 @@ def harmed(folder: Path) -> Rows:
 
 def witnessed(folder: Path) -> Rows:
     """What was done to a training of its own, with an independent witness; the folder is odd."""
-    with training(folder, "max_updates=0", *OURS, LEARNS_LITTLE, OFTEN) as target:
+    with training(folder, "max_updates=0", *OURS, LEARNS_LITTLE, OFTEN, SILENCE) as target:
         witness, rows = Witness(str(folder), target.setup), Rows()
         witness.start()
         target.goes_on(100.0)
@@ -181,7 +199,6 @@ def witnessed(folder: Path) -> Rows:
 
 def acknowledged_again(witness: Witness) -> bool:
     """Whether more of what a witness plays is acknowledged from now on."""
-    before, until_s = witness.acknowledged, time.monotonic() + ENDS_S
-    while witness.acknowledged == before and witness.is_alive() and time.monotonic() < until_s:
-        time.sleep(0.1)
+    before = witness.acknowledged
+    until(lambda: witness.acknowledged > before or not witness.is_alive(), ENDS_S)
     return witness.acknowledged > before

@@ -19,6 +19,8 @@ import psutil
 import yaml
 import zmq
 
+from master.config import KeysConfig
+from master.hub.giving import change_keys
 from tangram_core.errors import TangramError
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
@@ -47,6 +49,7 @@ OURS = (*SETTINGS, "service.envs=4")
 ROOM_MIB = 64.0  # that the memory of a master may grow by under any attack
 ENDS_S = 60.0
 LOOK_S = 0.1
+KEYS_S = 1.5  # the master looks once in a second who has a key
 HOST = "127.0.0.1"
 
 
@@ -91,9 +94,13 @@ class Target:
     @property
     def master(self) -> psutil.Process:
         """The process that learns."""
-        found = [p for p, line in processes_of(self.folder).items() if "tangram-master" in line]
+        return self.process("tangram-master")
+
+    def process(self, words: str) -> psutil.Process:
+        """One of the run whose title holds these words; TangramError if there is none."""
+        found = [p for p, line in processes_of(self.folder).items() if words in line]
         if not found:
-            raise TangramError("no master runs")
+            raise TangramError(f"there is no {words}")
         return found[0]
 
     def numbers(self) -> Mapping[str, float]:
@@ -141,10 +148,23 @@ class Target:
         """The folder of its checkpoints."""
         return self.folder / "checkpoints"
 
+    def given(self, name: str) -> Path:
+        """The connection file of somebody who has a key of his own."""
+        file = self.folder.with_name(f"{name}.json")
+        if not file.exists():
+            change_keys(KeysConfig(str(self.folder), add=name, out=str(file)))
+            time.sleep(KEYS_S)
+        return file
+
     @contextmanager
-    def peer(self, kind: int = zmq.DEALER, role: str = "player", **options: int) -> Iterator[Any]:
-        """A socket with the keys of a role; of an unknown role, with new ones; of none, without."""
-        where, address = self.where, find_master(str(self.folder))
+    def peer(
+        self, kind: int = zmq.DEALER, role: str = "player", file: Path | None = None, **options: int
+    ) -> Iterator[Any]:
+        """A socket with the keys of a role; of an unknown role, with new ones; of none, without.
+
+        The keys are the run's own, or those of a connection file.
+        """
+        where, address = self.where, find_master(str(file or self.folder))
         with self.context.socket(kind) as one:
             one.setsockopt(zmq.LINGER, 0)
             one.setsockopt(zmq.SNDTIMEO, 5000)  # it may be gone
@@ -160,11 +180,15 @@ class Target:
             yield one
 
     def ask(
-        self, *messages: list[bytes], role: str = "player", unanswered: int = 0
+        self,
+        *messages: list[bytes],
+        role: str = "player",
+        unanswered: int = 0,
+        file: Path | None = None,
     ) -> Counter[str]:
         """The kinds of the answers that a new connection gets, to all but so many messages."""
         answers, count = Counter[str](), len(messages) - unanswered
-        with self.peer(role=role) as one:
+        with self.peer(role=role, file=file) as one:
             for frames in messages:
                 one.send_multipart(frames)
             while answers.total() < count and one.poll(2000):
@@ -236,8 +260,19 @@ def episodes_of(setup: Setup, count: int) -> Episodes:
     )
 
 
-def one_line(*arguments: str, cwd: Path) -> Seen:
-    """Whether a command refuses in one line, with status 2."""
+def until(done: Callable[[], object], within_s: float = ENDS_S) -> bool:
+    """Wait for something; False if it does not come in time. What fails has not come yet."""
+    until_s = time.monotonic() + within_s
+    while time.monotonic() < until_s:
+        with suppress(TangramError, psutil.Error, OSError):
+            if done():
+                return True
+        time.sleep(LOOK_S)
+    return False
+
+
+def one_line(*arguments: str, cwd: Path, status: int = 2) -> Seen:
+    """Whether a command refuses in one line, with an exit status."""
     done = subprocess.run(
         [*command(arguments[0]), *arguments[1:]],
         cwd=cwd,
@@ -248,7 +283,10 @@ def one_line(*arguments: str, cwd: Path) -> Seen:
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
     )
     lines = done.stderr.strip().splitlines()
-    return (done.returncode, len(lines)) == (2, 1), f"{len(lines)} lines: {' '.join(lines)[-90:]}"
+    return (done.returncode, len(lines)) == (
+        status,
+        1,
+    ), f"{len(lines)} lines: {' '.join(lines)[-90:]}"
 
 
 def tried(attacks: Iterable[Attack], target: Any) -> Iterator[dict[str, Any]]:

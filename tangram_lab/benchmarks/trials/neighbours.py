@@ -1,0 +1,217 @@
+"""What those may do who were given a key of their own, and what others notice of it."""
+
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+from threading import Thread
+
+import zmq
+
+from master.config import KeysConfig
+from master.hub.giving import change_keys
+from tangram_core.errors import TangramError
+from tangram_core.wire.messages import EpisodeBatch, Heartbeat
+from tangram_core.wire.schema import MAX_COUNT, seal
+from tangram_lab.benchmarks.trials.target import (
+    ENDS_S,
+    KEYS_S,
+    LOOK_S,
+    Attack,
+    Seen,
+    Target,
+    episodes_of,
+    until,
+)
+from worker.talk.client import Client
+
+BATCH = 2  # episodes: a slow learner takes in many of them
+FAIR = 0.8  # of the share that a key would have, all alike
+FLOOD_S, SETTLE_S = 5.0, 2.0
+ESCAPE = "\x1b]0;owned\x07\x1b[2J"
+
+
+class Steady(Thread):
+    """A worker with a key of its own that keeps the rules; it has played before.
+
+    Attributes:
+        acknowledged: batches.
+    """
+
+    def __init__(self, target: Target, name: str = "alice") -> None:
+        super().__init__(name=name, daemon=True)
+        self.acknowledged, self._ends = 0, False
+        self._target, self._connect = target, str(target.given(name))
+
+    def __enter__(self) -> "Steady":
+        self.start()
+        self.more(1)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ends = True
+        self.join(ENDS_S)
+
+    def run(self) -> None:
+        """Send, as fast as it is acknowledged."""
+        setup = self._target.setup
+        episodes = episodes_of(setup, BATCH)
+        with Client(self._connect, "player", -1, setup.fingerprints(), setup.spec) as client:
+            client.on_progress = lambda: self._look(client)
+            client.join()
+            while client.wait_for_window():
+                client.send(episodes, 0)
+
+    def more(self, count: int) -> bool:
+        """Whether so many more are acknowledged in time."""
+        goal = self.acknowledged + count
+        until(lambda: self.acknowledged >= goal or not self.is_alive())
+        return self.acknowledged >= goal
+
+    def _look(self, client: Client) -> None:
+        self.acknowledged = client.acknowledged
+        if self._ends:
+            client.stop("the trial is over")
+
+
+def stolen(target: Target, kill: bool = False) -> Seen:
+    """Mallory says HELLO with all that alice's lines of the audit tell, and BYE."""
+    with Steady(target) as alice:
+        lines = (target.folder / "audit.jsonl").read_text().splitlines()
+        hers = [one for one in map(json.loads, lines) if one.get("key") == "alice"][-1]
+        fields = {name: hers[name] for name in ("index", "incarnation", "process")}
+        bye, mallory = seal("bye", {"reason": "x"}, []), target.given("mallory")
+        if kill:
+            target.master.kill()
+            time.sleep(LOOK_S)
+        answers = 0
+        for first in (1, MAX_COUNT):
+            with suppress(TangramError, OSError, zmq.ZMQError):
+                said = target.hello(**fields, first=first), bye
+                answers += target.ask(*said, unanswered=1, file=mallory)["welcome"]
+        held = alice.more(8) and not answers
+    losses = target.told().count("acknowledged which are not in")
+    return held and not losses, f"{answers} let in, alice goes on: {held}, {losses} losses told"
+
+
+def flood(target: Target, kind: str, connections: int) -> None:
+    """What mallory says as fast as it is taken, from many connections, for as long as he lives."""
+    os.nice(19)  # it is the master's share that counts, not the machine's
+    spec, episodes = target.setup.spec, episodes_of(target.setup, BATCH)
+    damaged = [frame[:-1] + b"\0" for frame in EpisodeBatch(1, 0, episodes).encode(spec)]
+    words = {"heartbeats": Heartbeat({}).encode(), "damaged": damaged}
+    target.context, numbers = zmq.Context(), [0] * connections
+    target.context.set(zmq.MAX_SOCKETS, 4096)
+    with ExitStack() as opened:
+        keys = target.given("mallory")
+        ends = [opened.enter_context(target.peer(file=keys, SNDHWM=64)) for _ in numbers]
+        for number, one in enumerate(ends):
+            one.send_multipart(target.hello(index=5000 + number, process=f"hog {number}"))
+        while True:
+            for place, one in enumerate(ends):
+                while one.poll(0):
+                    one.recv_multipart()
+                batch = EpisodeBatch(numbers[place] + 1, 0, episodes)
+                with suppress(zmq.Again):
+                    one.send_multipart(words.get(kind) or batch.encode(spec), zmq.NOBLOCK)
+                    numbers[place] += 1
+
+
+@contextmanager
+def flooding(target: Target, kind: str, connections: int) -> Iterator[None]:
+    """In another process, so that alice has her own."""
+    target.given("mallory")
+    hog = multiprocessing.get_context("fork").Process(
+        target=flood, args=(target, kind, connections), daemon=True
+    )
+    hog.start()
+    try:
+        yield
+    finally:
+        hog.kill()
+        hog.join()
+
+
+def shared(target: Target, kind: str, connections: int) -> Seen:
+    """Whether alice and the run's own keep their shares of three while mallory floods."""
+    with Steady(target) as alice:
+
+        def rates() -> tuple[float, float]:
+            """Of alice and of all, in transitions per second."""
+            before, begun = alice.acknowledged, time.monotonic()
+            whole = target.numbers()["transitions"]
+            time.sleep(FLOOD_S)
+            whole, took = target.numbers()["transitions"] - whole, time.monotonic() - begun
+            per_batch = episodes_of(target.setup, BATCH).transitions
+            return (alice.acknowledged - before) * per_batch / took, whole / took
+
+        alone = rates()
+        with flooding(target, kind, connections):
+            time.sleep(SETTLE_S)
+            hers, whole = rates()
+    fair = min(alone[0], whole / 3.0)
+    seen = f"alice {hers:.0f} of {whole:.0f}, before {alone[0]:.0f} of {alone[1]:.0f} a second"
+    return hers >= FAIR * fair and whole >= FAIR * alone[1] / 2.0, seen
+
+
+def revoked(target: Target) -> Seen:
+    """What somebody says whose key was taken back."""
+    file = target.given("eve")
+    change_keys(KeysConfig(str(target.folder), revoke="eve"))
+    time.sleep(KEYS_S)
+    hello = target.hello(index=3050, process="eve")
+    answers = target.ask(hello, unanswered=0, file=file)
+    held = not answers and target.goes_on()
+    file.unlink()
+    return held, f"{answers.total()} answers"
+
+
+def escapes(target: Target) -> Seen:
+    """What a terminal would obey, in all texts that a worker may send."""
+    hello = target.hello(index=3060, process=ESCAPE)
+    answers = target.ask(hello, seal("bye", {"reason": ESCAPE}, []), unanswered=1)
+    log = (target.folder / "audit.jsonl").read_text()
+    raw = sum(sign in text for sign in "\x1b\x07" for text in (target.told(), log))
+    return not raw and target.goes_on(), f"{raw} raw, answered {dict(answers)}"
+
+
+def said(target: Target, fields: dict[str, object], answer: str) -> Seen:
+    """What a HELLO is answered, and whether the training goes on."""
+    own: dict[str, object] = {"index": 3070, "process": "said"}
+    answers = target.ask(target.hello(**own | fields))
+    return answers == {answer: 1} and target.goes_on(), f"answered: {dict(answers)}"
+
+
+WRONG: dict[str, tuple[dict[str, object], str]] = {
+    "another run": ({"run_id": "other"}, "refused"),
+    "other settings": ({"fingerprints": {}}, "refused"),
+    "an unknown role": ({"role": "root"}, "reject"),
+    "a role of another key": ({"role": "evaluator"}, "refused"),
+    "an index below all": ({"index": -2}, "reject"),
+    "an index beyond all": ({"index": 10**9}, "reject"),
+    "a name of 10,000 letters": ({"process": "x" * 10**4}, "reject"),
+    "another protocol": ({"v": 1}, "refused"),
+}
+FLOODS = (("batches", 64), ("heartbeats", 1), ("damaged", 8))
+NEIGHBOURS: list[Attack] = [
+    ("14", "another's index, incarnation and process", "2 HELLO, BYE", stolen),
+    ("14", "the same once the master was killed", "1 kill", partial(stolen, kill=True)),
+    *(
+        (
+            "15",
+            f"a key that floods with {kind}",
+            f"{count}, {FLOOD_S:g} s",
+            partial(shared, kind=kind, connections=count),
+        )
+        for kind, count in FLOODS
+    ),
+    ("20", "escapes in texts", "2", escapes),
+    ("held", "a key that was taken back", "1", revoked),
+    *(
+        ("held", f"HELLO with {what}", "1", partial(said, fields=fields, answer=answer))
+        for what, (fields, answer) in WRONG.items()
+    ),
+]
