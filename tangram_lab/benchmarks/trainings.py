@@ -65,10 +65,10 @@ def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
 
 def processes_of(folder: Path) -> dict[psutil.Process, str]:
     """Process -> command line, of those that name a run folder."""
-    found = {}
+    found, quoted = {}, override("in", str(folder)).removeprefix("in='").removesuffix("'")
     for process in psutil.process_iter(["cmdline"]):
         line = " ".join(process.info["cmdline"] or ())  # none of a process that ended meanwhile
-        if str(folder) in line and process.pid != os.getpid():
+        if (str(folder) in line or quoted in line) and process.pid != os.getpid():
             found[process] = line
     return found
 

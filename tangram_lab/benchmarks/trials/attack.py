@@ -23,11 +23,12 @@ from tangram_lab.benchmarks.trials.target import (
     started,
     training,
     tried,
+    until,
 )
 
 ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")  # and on the same ever after
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
-UPDATES = 200  # before the attacks begin
+UPDATES, LAG = 200, 100  # before the attacks begin
 
 
 def ends_in_order() -> None:
@@ -74,6 +75,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
         with training(live, "max_updates=0", *ON_A_PORT, port, *OURS, OFTEN) as target:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
             target.goes_on(UPDATES, "updates")
+            until(lambda: target.numbers()["lag_updates"] < LAG)  # from what it began with
             rows = list(tried(BESIEGED, target))
             meanwhile = pool.submit(harmed, folder)
             undisturbed = others.enter_context(started(straight, "max_updates=0", *OURS))

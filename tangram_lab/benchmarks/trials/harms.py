@@ -90,7 +90,7 @@ def folder_away(target: Target) -> Seen:
     stopped = not target.folder.exists()
     if stopped:
         away.rename(target.folder)
-    held, told = stopped and target.goes_on(10.0), f"{target.folder} is gone" in target.told()
+    held, told = stopped and target.goes_on(10.0), f"{target.folder.name} is gone" in target.told()
     seen = f"made again by accident: {not stopped}; told: {told}; goes on when it is back: {held}"
     return held and told, seen
 
