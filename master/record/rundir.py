@@ -17,7 +17,7 @@ import yaml
 from master.config import MasterConfig
 from master.record.journal import segments
 from master.record.lease import Lease, LostError
-from tangram_core.errors import ConfigError, RunError, TangramError, UnavailableError
+from tangram_core.errors import ConfigError, RunError, UnavailableError
 from tangram_core.run.code import code_of, own_code, read_code
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.run.outcome import bound_of, read_outcome
@@ -202,7 +202,7 @@ class Claim:
             self._take()
         except LostError as error:
             raise FolderError(f"run_dir {path} is lost: {error}") from None
-        except (OSError, TangramError) as error:
+        except (OSError, ConfigError, UnavailableError) as error:
             why = error.strerror if isinstance(error, OSError) else "another process works there"
             raise FolderError(f"run_dir {path} cannot be claimed anew ({why})") from None
         self._release(*before)

@@ -26,6 +26,8 @@ from tangram_lab.benchmarks.trials.attacks import (
 )
 from tangram_lab.benchmarks.trials.chaos import Witness
 from tangram_lab.benchmarks.trials.harms import LOCKSTEP, OWN, acknowledged_again
+from tangram_lab.benchmarks.trials.neighbours import NEIGHBOURS, is_fair
+from tangram_lab.benchmarks.trials.starts import STARTS
 from tangram_lab.benchmarks.trials.target import Attack, Growth, Seen, Target, tried
 from tests.agent.builders import setup
 
@@ -50,10 +52,19 @@ def test_what_is_done_beside_ends_with_an_attack_that_is_stopped() -> None:
 
 
 def test_all_rows_are_tried() -> None:
-    """Row 4 and others twice, in several ways."""
-    rows = {one[0] for one in (*BESIEGED, *LIVE, *OWN, *LOCKSTEP)}
-    with_files = {"7", "11", "13"}  # tests/master/record, tests/core and tests/cluster
-    assert rows == {"held", *map(str, range(1, 14))} - with_files
+    """Row 4 and others several times, in several ways."""
+    every = (*BESIEGED, *NEIGHBOURS, *LIVE, *OWN, *STARTS, *LOCKSTEP)
+    with_files = {"7", "11", "13", "19"}  # tests/master/record, core, cluster, studio and slurm
+    assert {one[0] for one in every} == {"held", *map(str, range(1, 22))} - with_files
+    assert len({one[1] for one in every}) == len(every) >= 50
+
+
+@pytest.mark.parametrize(
+    ("hers", "whole", "fair"),
+    [(40.0, 120.0, True), (33.0, 120.0, True), (31.0, 120.0, False), (40.0, 59.0, False)],
+)
+def test_a_share_is_eight_tenths_of_a_third(hers: float, whole: float, fair: bool) -> None:
+    assert is_fair((60.0, 150.0), (hers, whole)) is fair
 
 
 class Standing(Target):

@@ -33,7 +33,7 @@ from worker.talk.client import Client
 LEARNS_LITTLE = "agent.updates_per_transition=0.1"  # nobody asks for its score
 SILENCE = "service.silence_seconds=6"
 BUSY_PERCENT = 20.0  # of a core: between scores it sleeps
-ODD_NAME = "a=run of \"ü'\\"
+ODD_NAME = "a=run \\of \"ü'"
 
 
 def sockets_of_others(target: Target) -> Seen:

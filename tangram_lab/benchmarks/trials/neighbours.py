@@ -152,9 +152,19 @@ def shared(target: Target, kind: str, connections: int) -> Seen:
         with flooding(target, kind, connections):
             time.sleep(SETTLE_S)
             hers, whole = rates()
-    fair = min(alone[0], whole / 3.0)
-    seen = f"alice {hers:.0f} of {whole:.0f}, before {alone[0]:.0f} of {alone[1]:.0f} a second"
-    return hers >= FAIR * fair and whole >= FAIR * alone[1] / 2.0, seen
+    seen = f"alice {hers:.1f} of {whole:.1f}, before {alone[0]:.1f} of {alone[1]:.1f} a second"
+    return is_fair(alone, (hers, whole)), seen
+
+
+def is_fair(alone: tuple[float, float], flooded: tuple[float, float]) -> bool:
+    """Whether one of three keys keeps its share, and a flood takes a half of all at most.
+
+    Args:
+        alone: transitions per second of one key, and of all, before.
+        flooded: the same meanwhile.
+    """
+    fair = min(alone[0], flooded[1] / 3.0)
+    return flooded[0] >= FAIR * fair and flooded[1] >= FAIR * alone[1] / 2.0
 
 
 def revoked(target: Target) -> Seen:

@@ -128,7 +128,7 @@ STARTS: list[Attack] = [
         partial(goes_on, name="tensorboard", content=b"x"),
     ),
     (
-        "22",
+        "21",
         "a lease that a machine left which died",
         "1",
         partial(goes_on, name=LEASE, content=b'{"host": "x", "id": "y"}'),
