@@ -38,6 +38,7 @@ from tangram_core.store.checkpoints import (
 )
 
 MINUTE_S = 60.0
+BETWEEN = 9.0  # times what a checkpoint took: the learner has nine tenths beside a slow disk
 RETRY_S = 1.0
 KEPT = 2  # newest checkpoints: the one before, if the newest is damaged
 WAIT = "until then nothing is acknowledged, and workers keep what they played"
@@ -100,7 +101,9 @@ class Checkpointer:
             if self._look.due():
                 self._keep_safe()
             if self._checkpoint.due():
+                begun_s = time.monotonic()
                 self.save()
+                self._checkpoint.rest(BETWEEN * (time.monotonic() - begun_s))
         except (JournalError, FolderError, DiskError) as error:
             self._failed(error)
 

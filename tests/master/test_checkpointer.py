@@ -3,6 +3,7 @@
 import errno
 import logging
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,25 @@ def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> No
     stage.disk.room = ROOM
     stage.checkpointer.tick()
     assert len(list_checkpoints(stage.folder / "checkpoints")) == 2
+
+
+def test_a_slow_disk_takes_a_tenth_of_the_time(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, saved = [time.monotonic()], list[float]()
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+
+    def save() -> None:
+        now[0] += 10.0
+        saved.append(now[0])
+
+    monkeypatch.setattr(stage.checkpointer, "save", save)
+    stage.checkpointer._checkpoint = Every(1.0)
+    begun = now[0]
+    for _ in range(200):
+        now[0] += 1.0
+        stage.checkpointer.tick()
+    assert np.round(np.subtract(saved, begun)).tolist() == [11.0, 111.0, 211.0]
 
 
 def test_only_what_is_finite_is_saved(stage: Stage) -> None:
