@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 
-from tangram_core.conformance import play
+from tangram_agent.agents.scene.scenes import Scenes
+from tangram_core.conformance import check_agent, play
 from tangram_core.seeding import episode_generator
+from tests.agent.builders import SCENE, SMALL, SQUARE, setup
 from tests.core.examples import example
 from tests.sim.builders import evaluation_generators
 
@@ -27,3 +30,34 @@ def test_the_agent_of_the_examples_learns_their_task() -> None:
     own = evaluation_generators(50)
     tests = play(task, task.make(50), own, lambda seen, past, _: actor.act(seen, past))
     assert task.score(tests)["success"] >= 0.9
+
+
+def test_the_shortest_path_knows_the_angle_and_where_an_action_leads() -> None:
+    path, made = example("paper_path"), setup(SQUARE, agent=SCENE, net=SMALL)
+    graph = path.AngleGraph(made.task.layout)
+    square = torch.tensor([[-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])
+
+    def turned(degrees: float) -> torch.Tensor:
+        turn = torch.tensor([[0.0, 0.0, degrees / 180.0]])
+        return path.moved(graph, scene(square), turn).corners[0]
+
+    def scene(corners: torch.Tensor) -> Scenes:
+        placed, token = torch.zeros(1, 1, dtype=torch.bool), torch.zeros(1, dtype=torch.long)
+        return Scenes(corners[None], placed, square[None], token)
+
+    for degrees, told in (
+        (0.0, (1.0, 0.0)),
+        (90.0, (1.0, 0.0)),
+        (45.0, (-1.0, 0.0)),
+        (22.5, (0.0, -1.0)),
+    ):
+        features = graph.node_features(scene(turned(degrees)))
+        assert features.shape[-1] == graph.features
+        np.testing.assert_allclose(
+            features[0, :, -2:].numpy(), [told] * features.shape[1], atol=1e-5
+        )
+    there = path.moved(graph, scene(square), torch.tensor([[0.25, -0.5, 0.0]]))
+    np.testing.assert_allclose(
+        there.corners[0].numpy(), square + torch.tensor([0.5, -1.0]), atol=1e-6
+    )
+    check_agent(path.Both(made.agent.config, made.agent.net), made.task)
