@@ -38,7 +38,9 @@ from tangram_core.store.checkpoints import (
 )
 
 MINUTE_S = 60.0
-BETWEEN = 9.0  # times what a checkpoint took: the learner has nine tenths beside a slow disk
+# Times what a checkpoint took, so that a slow disk leaves nine tenths to the learner; at most an
+# hour, since the process may have been stopped meanwhile.
+BETWEEN, MOST_BETWEEN_S = 9.0, 3600.0
 RETRY_S = 1.0
 KEPT = 2  # newest checkpoints: the one before, if the newest is damaged
 WAIT = "until then nothing is acknowledged, and workers keep what they played"
@@ -103,7 +105,8 @@ class Checkpointer:
             if self._checkpoint.due():
                 begun_s = time.monotonic()
                 self.save()
-                self._checkpoint.rest(BETWEEN * (time.monotonic() - begun_s))
+                took_s = time.monotonic() - begun_s
+                self._checkpoint.rest(min(BETWEEN * took_s, MOST_BETWEEN_S))
         except (JournalError, FolderError, DiskError) as error:
             self._failed(error)
 

@@ -100,23 +100,27 @@ def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> No
     assert len(list_checkpoints(stage.folder / "checkpoints")) == 2
 
 
-def test_a_slow_disk_takes_a_tenth_of_the_time(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("takes_s", "rests_s"), [(10.0, 90.0), (1000.0, 3600.0)])
+def test_a_slow_disk_takes_a_tenth_of_the_time_for_an_hour(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch, takes_s: float, rests_s: float
 ) -> None:
     now, saved = [time.monotonic()], list[float]()
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
 
     def save() -> None:
-        now[0] += 10.0
+        now[0] += takes_s
         saved.append(now[0])
 
     monkeypatch.setattr(stage.checkpointer, "save", save)
     stage.checkpointer._checkpoint = Every(1.0)
     begun = now[0]
-    for _ in range(200):
+    for _ in range(int(rests_s) + 2):
         now[0] += 1.0
         stage.checkpointer.tick()
-    assert np.round(np.subtract(saved, begun)).tolist() == [11.0, 111.0, 211.0]
+    assert np.round(np.subtract(saved, begun)).tolist() == [
+        1.0 + takes_s,
+        1.0 + 2.0 * takes_s + rests_s,
+    ]
 
 
 def test_only_what_is_finite_is_saved(stage: Stage) -> None:
