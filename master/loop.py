@@ -105,12 +105,12 @@ class Loop:
         """
         until_s = time.monotonic() + INSERT_S
         while len(self._arrived) and self._limiter.may_insert() and self.budget.takes_episodes():
-            if time.monotonic() >= until_s:
-                return True
             arrival = self._arrived.first()
             if not self.checkpointer.keep(arrival):
                 return False
             self._insert(self._arrived.serve(arrival.episodes.transitions))
+            if time.monotonic() >= until_s:
+                return True
         return False
 
     def insert_round(self, lockstep: Lockstep) -> None:

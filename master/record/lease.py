@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from tangram_core.errors import TangramError, UnavailableError
-from tangram_core.run.process import Every, still_alive
+from tangram_core.run.process import Every, still_alive, watching
 
 RENEW_S = 10.0
 STALE_S = 60.0  # after which one that is not renewed is nobody's
@@ -49,6 +49,7 @@ class Lease:
         except OSError as error:
             why = error.strerror
             log.warning("%s cannot be written (%s): other machines are not seen", path, why)
+        watching.append(self._keep)  # a checkpoint may take longer than others wait
 
     def renew(self) -> None:
         """Say that its process lives, where it is time.
@@ -63,10 +64,15 @@ class Lease:
             raise LostError(f"a process on {self._lost} has taken it over")
 
     def close(self) -> None:
-        """Leave the folder to others."""
+        """Leave the folder to others, if it is this one's still."""
+        watching.remove(self._keep)
         with suppress(OSError):
             if self._holder()[1] == self._id:
                 self._path.unlink()
+
+    def _keep(self) -> None:
+        with suppress(LostError):  # told when it is asked next
+            self.renew()
 
     def _renew(self) -> None:
         try:

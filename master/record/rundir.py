@@ -198,13 +198,15 @@ class Claim:
                 raise FolderError(f"run_dir {path} is gone")
             if not is_same(self._folder, path) and self.run.holds_more():
                 raise FolderError(f"run_dir {path} is another folder now, with a run in it")
-            before = self._lock, self._folder
+            before, lease = (self._lock, self._folder), self._lease
             self._take()
         except LostError as error:
             raise FolderError(f"run_dir {path} is lost: {error}") from None
         except (OSError, ConfigError, UnavailableError) as error:
             why = error.strerror if isinstance(error, OSError) else "another process works there"
             raise FolderError(f"run_dir {path} cannot be claimed anew ({why})") from None
+        if lease is not None:
+            lease.close()
         self._release(*before)
         return True
 

@@ -113,13 +113,13 @@ WATCHDOG_S = 300.0  # without progress: longer than a large checkpoint on a slow
 PATIENT_S = 3600.0  # where a compiler runs: minutes for a large update on a busy machine
 
 
-_watching: list["Watchdog"] = []
+watching = list[Callable[[], object]]()  # called while something long makes progress
 
 
 def still_alive() -> None:
-    """Tell the process's watchdog, if it has one, of progress: a disk may be slow for long."""
-    for one in _watching:
-        one.progress()
+    """Tell the process's watchdog, and others who ask, of progress: a disk may be slow for long."""
+    for progressed in watching:
+        progressed()
 
 
 class Watchdog:
@@ -135,11 +135,11 @@ class Watchdog:
 
     def __enter__(self) -> Self:
         self._wind()
-        _watching.append(self)
+        watching.append(self.progress)
         return self
 
     def __exit__(self, *_: object) -> None:
-        _watching.remove(self)
+        watching.remove(self.progress)
         if self._seconds:
             faulthandler.cancel_dump_traceback_later()
 

@@ -33,6 +33,7 @@ BATCH = 4
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """All updates that are due come in one go, however busy the machine is."""
     monkeypatch.setattr(loop_module, "LEARN_S", 600.0)
+    monkeypatch.setattr(loop_module, "INSERT_S", 600.0)
 
 
 def batches(count: int, size: int = BATCH) -> list[list[Any]]:
@@ -92,6 +93,17 @@ def test_each_key_has_an_equal_share_of_what_is_learned_from(tmp_path: Path) -> 
     made.receive(0.0)
     made.insert()
     assert hub.values("acknowledge") == [1, 11, 2, 12, 3, 13, 4, 5, 6, 7, 8]
+
+
+def test_inserts_stop_for_the_sockets_and_go_on_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = FakeHub(MADE, [[arrival(MADE, i, BATCH) for i in range(1, 4)]])
+    made = loop(tmp_path, MADE, hub, lag_updates=64)
+    monkeypatch.setattr(loop_module, "INSERT_S", 0.0)
+    made.receive(0.0)
+    assert made.insert()
+    assert hub.values("acknowledge") == [1]
 
 
 def test_sockets_are_served_between_updates(

@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 
 from master.record import lease as lease_module
-from master.record.lease import Lease
+from master.record.lease import Lease, LostError
 from master.record.rundir import LEASE, FolderError, RunFolder
 from tangram_core.errors import ConfigError, UnavailableError
+from tangram_core.run.process import still_alive
 
 pytestmark = pytest.mark.fast
 
@@ -144,3 +145,21 @@ def test_a_file_system_without_locks_is_told(
     told = r"/\.lock cannot be locked by flock \(No locks available\): choose a run_dir on a file"
     with pytest.raises(ConfigError, match=told):
         RunFolder(tmp_path).lock()
+
+
+def test_it_is_renewed_while_a_checkpoint_is_written_and_no_longer_than_it_is_held(
+    tmp_path: Path,
+) -> None:
+    lease = Lease(tmp_path / LEASE)
+    os.utime(tmp_path / LEASE, (0.0, 0.0))
+    still_alive()
+    assert (tmp_path / LEASE).stat().st_mtime > 0.0
+    of_another(tmp_path)
+    still_alive()
+    with pytest.raises(LostError, match="a process on far has taken it over"):
+        lease.renew()
+    lease.close()
+    assert (tmp_path / LEASE).exists()
+    os.utime(tmp_path / LEASE, (0.0, 0.0))
+    still_alive()
+    assert (tmp_path / LEASE).stat().st_mtime == 0.0
