@@ -1,6 +1,8 @@
 """The shortest path from the paper's agent to one that learns the angle.
 
-Two changes of its networks, each alone and both. The rows of docs/paper.md were trained like this:
+Two changes of its networks, each alone and both, for a square whose motion is known. The row of
+docs/paper.md with all three changes was trained like this, the others with Angle, Afterstate,
+or agent.actor_delay=51:
 
     tangram-train agent=docs/examples/paper_path.py:Both sim=paper reward.source=camera \
         net=mha_small service=jobs service.compile=true max_episodes=24000 max_updates=0 \

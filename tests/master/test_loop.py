@@ -240,7 +240,10 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, o
         assert all(np.isfinite(array).all() for array in newest.arrays[part].values())
 
 
-def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
+def test_checkpoints_come_on_their_interval(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("master.checkpointer.BETWEEN", 0.0)
     hub = FakeHub(MADE, batches(3))
     service = {"checkpoint_minutes": 1e-3, "publish_seconds": 1000.0}
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
