@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from conf.cli import entry, tell
 from conf.commands import Plain
-from tangram_core.errors import ConfigError, TangramError
+from tangram_core.errors import OwnCodeError, TangramError
 from tangram_core.registry import AGENT, SHA256, TASK
 from tangram_core.run.code import code_of, where
 from tangram_core.run.process import VARIABLE
@@ -83,7 +83,7 @@ def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
         own = ", ".join(f"{name}={value}" for name, value in code_of(settings).items())
         if not own:
             raise
-        raise ConfigError(f"{own} failed: {where(error)}: mend it") from error
+        raise OwnCodeError(f"{own} failed: {where(error)}: mend it") from error
 
 
 def _made(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":

@@ -5,7 +5,7 @@ import signal
 import sys
 import time
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Any
@@ -171,7 +171,7 @@ class Launcher:
             if child.next_start_s is not None and time.monotonic() >= child.next_start_s:
                 try:
                     child.start(self._events.put)
-                except UnavailableError as error:
+                except (UnavailableError, OSError) as error:
                     child.clear()
                     child.plan_restart(UNAVAILABLE_STATUS)
                     self._say(f"{child.name}: {error} (tried again {child.plan})")
@@ -219,7 +219,8 @@ class Launcher:
         if status == 0 or self._stop_s is not None or not self._master.plan_restart(status):
             return False
         # A worker that is started meanwhile must not look for the one that is gone.
-        self._folder.connection.unlink(missing_ok=True)
+        with suppress(OSError):  # a disk that failed
+            self._folder.connection.unlink(missing_ok=True)
         self._reached = False
         self._master.arguments = [
             "resume=auto" if text.startswith("resume=") else text for text in self._master.arguments

@@ -10,11 +10,14 @@ source "$PROJECT/slurm/lib.sh"
 
 threads=${SLURM_CPUS_PER_TASK:-1}
 export OMP_NUM_THREADS=$threads MKL_NUM_THREADS=$threads OPENBLAS_NUM_THREADS=$threads
+STEADY_S=60 # one that lived for so long starts with a clean record
 child=
 
 leave() { # SIGNAL
+    local signal=$1
     leaving=1
-    [[ -z $child ]] || kill "-$1" "$child" 2>/dev/null || true
+    [[ $signal != INT ]] || signal=TERM # bash lets what runs in the background ignore INT
+    [[ -z $child ]] || kill "-$signal" "$child" 2>/dev/null || true
 }
 for signal in TERM INT HUP USR1; do
     # shellcheck disable=SC2064 # the name as it is now
@@ -22,9 +25,11 @@ for signal in TERM INT HUP USR1; do
 done
 
 while true; do
+    began=$SECONDS
     become tangram-master "$(setting run_dir "$RUN_DIR")" resume=auto "service.threads=$threads" "$@" &
     child=$!
     await "$child"
     child=
+    ((SECONDS - began < STEADY_S)) || wait_s=1
     try_later "the master" || exit "$status"
 done

@@ -8,8 +8,8 @@ set -euo pipefail
 
 STAY=${STAY:-}
 PATIENCE_S=${PATIENCE_S:-86400} # for a master that is not there; one of the same job ends with it
-LATE_S=30                      # before an old result counts: a run that is extended clears it
 STEADY_S=60                    # a worker that lived for so long starts with a clean record
+LATE_S=30                      # before an old result counts: a run that is extended clears it
 MAX_FAILURES=5                 # in a row
 USAGE_STATUS=2                 # of wrong settings, which do not mend themselves
 
@@ -42,6 +42,7 @@ await_master() {
 }
 
 failures=0
+unavailable=
 while true; do
     await_master
     began=$SECONDS
@@ -58,6 +59,15 @@ while true; do
         continue
     fi
     ((SECONDS - began < STEADY_S)) || failures=0 wait_s=1
+    # It waits for ten minutes itself where a master is gone.
+    ((status == UNAVAILABLE_STATUS && SECONDS - began < 15 * STEADY_S)) || unavailable=
+    if ((status == UNAVAILABLE_STATUS)); then
+        unavailable=${unavailable:-$SECONDS}
+        if ((SECONDS - unavailable >= PATIENCE_S)); then
+            say "no master let the worker in within $PATIENCE_S s: it leaves"
+            exit "$status"
+        fi
+    fi
     if try_later "the worker"; then
         continue
     fi

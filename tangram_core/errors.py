@@ -5,7 +5,7 @@ status says whose fault it was: 2 the user's, who must change something, 75 the 
 """
 
 import os
-from errno import EADDRINUSE, EDQUOT, EIO, ENOMEM, ENOSPC, ESTALE
+from errno import EADDRINUSE, EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS, ESTALE
 
 # What reading a file raises that anybody may have written: it is missing, no JSON, or another one.
 UNREADABLE = (
@@ -18,8 +18,8 @@ UNREADABLE = (
     RecursionError,
 )
 USAGE_STATUS, UNAVAILABLE_STATUS = 2, os.EX_TEMPFAIL
-# A disk that is full or fails, no memory, a port that another process has.
-PASSING = (ENOSPC, EDQUOT, EIO, ESTALE, ENOMEM, EADDRINUSE)
+# A disk that is full or fails, no memory, no open files, a port that another process has.
+PASSING = (ENOSPC, EDQUOT, EIO, EROFS, ESTALE, ENOMEM, EMFILE, ENFILE, EADDRINUSE)
 
 
 class TangramError(Exception):
@@ -28,6 +28,10 @@ class TangramError(Exception):
 
 class ConfigError(TangramError):
     """A setting that cannot work."""
+
+
+class OwnCodeError(ConfigError):
+    """Code of the user's own fails, whatever it says of the environment."""
 
 
 class UnavailableError(TangramError):
@@ -48,7 +52,9 @@ class WireError(TangramError):
 
 def is_passing(error: BaseException | None) -> bool:
     """Whether an error, or the one that it was made of, is the environment's."""
-    while error is not None:
+    seen = set[int]()
+    while error is not None and id(error) not in seen and not isinstance(error, OwnCodeError):
+        seen.add(id(error))
         known = isinstance(error, UnavailableError | MemoryError)
         if known or getattr(error, "errno", None) in PASSING:
             return True

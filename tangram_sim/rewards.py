@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tangram_core.arrays import Floats, Pixels
-from tangram_core.errors import ConfigError
+from tangram_core.errors import ConfigError, OwnCodeError
 from tangram_core.run.code import load_code, read_code
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
@@ -200,7 +200,7 @@ def _checked(
     try:
         rewards = np.asarray(function(*given, layout), dtype=np.float64)
     except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
-        raise ConfigError(f"reward.name={name} failed: {type(error).__name__}: {error}") from error
+        raise OwnCodeError(f"reward.name={name} failed: {type(error).__name__}: {error}") from error
     if rewards.shape != (len(achieved),):
         raise ConfigError(
             f"reward.name={name} must return one number per row, shape ({len(achieved)},), "

@@ -21,7 +21,13 @@ from conf.kinds import Kinds, kinds_of
 from conf.settings import PAGE, page
 from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.base.config import RelabelConfig
-from tangram_core.errors import ConfigError, RunError, TangramError, UnavailableError
+from tangram_core.errors import (
+    ConfigError,
+    OwnCodeError,
+    RunError,
+    TangramError,
+    UnavailableError,
+)
 from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import KEY, PLAY, declared_fields
 from tangram_core.setup import Setup, from_mapping, make_setup
@@ -420,8 +426,17 @@ LOWER = "lower agent.replay_capacity, agent.batch_size or service.envs"
         *(
             (OSError(getattr(errno, name), "no", "/x"), status, f"cannot use /x (no): {ROOM}")
             for status, names in {
-                75: ("ENOSPC", "EDQUOT", "EIO", "ESTALE", "ENOMEM", "EADDRINUSE"),
-                2: ("EACCES", "EROFS", "ENOENT", "EMFILE", "EADDRNOTAVAIL"),
+                75: (
+                    "ENOSPC",
+                    "EDQUOT",
+                    "EIO",
+                    "EROFS",
+                    "ESTALE",
+                    "ENOMEM",
+                    "EMFILE",
+                    "EADDRINUSE",
+                ),
+                2: ("EACCES", "ENOENT", "EADDRNOTAVAIL"),
             }.items()
             for name in names
         ),
@@ -441,10 +456,19 @@ def test_entry_turns_errors_into_a_line_and_a_status(
     assert capsys.readouterr() == ("", f"tangram-eval: {line}\n" if line else "")
 
 
-@pytest.mark.parametrize(("number", "status"), [(errno.ENOSPC, 75), (errno.EACCES, 2)])
+@pytest.mark.parametrize(
+    ("number", "kind", "status"),
+    [
+        (errno.ENOSPC, ConfigError, 75),
+        (errno.EACCES, ConfigError, 2),
+        (errno.ENOSPC, OwnCodeError, 2),
+    ],
+)
 def test_an_error_that_was_made_of_another_has_the_status_of_that(
-    entered: Entered, number: int, status: int
+    entered: Entered, number: int, kind: type[TangramError], status: int
 ) -> None:
+    """Not where code of the user's own says so; nor for ever where one names itself."""
+
     def task(settings: Plain) -> int:
         try:
             try:
@@ -452,7 +476,8 @@ def test_an_error_that_was_made_of_another_has_the_status_of_that(
             except OSError:
                 raise RunError("cannot write") from None
         except RunError as error:
-            raise ConfigError("it failed") from error
+            error.__cause__ = error if status == 2 else error.__cause__
+            raise kind("it failed") from error
 
     assert entered("eval run_dir=x", task)[0] == status
 

@@ -118,7 +118,7 @@ class Admission:
                 f"this master runs '{self._info.run_id}', not '{hello.run_id}': the connection "
                 "file is stale, take the one of a master that is running"
             )
-            raise RefusedError("refused_run", Refused(reason))
+            raise RefusedError("refused_run", Refused(reason, later=True))
         if caller.role not in ("", hello.role):
             reason = f"the key '{caller.name}' is one for role={caller.role}, not for role="
             raise RefusedError("refused_keys", Refused(reason + hello.role))

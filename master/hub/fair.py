@@ -43,4 +43,6 @@ class FairQueue(Generic[Item]):
         item = waiting.popleft()
         if not waiting:
             del self._of[self._turn]
+        if not self._of:  # who has been served alone owes nobody
+            self._now = max(self._served.values())
         return item

@@ -53,6 +53,7 @@ from tangram_core.wire.schema import DamagedError, ProtocolError
 
 # What one poll spends under any load on reading and on answering, so that the loop gets its turn.
 READ_S, SERVE_S = 0.005, 0.01
+MESSAGE_S = 0.1  # that one costs at most; else the process was stopped meanwhile
 # Bytes of one key that are read and not answered yet; what is more is dropped, and sent again by
 # those that keep the rules. A message counts for so much at least.
 INBOX_BYTES, LEAST_BYTES = 128 * 2**20, 1024
@@ -104,7 +105,7 @@ class Hub:
         self._askers = defaultdict[str, Askers](Askers)
         self._inbox, self._unread = FairQueue[Received](), Counter[str]()
         self._orders: dict[int, Go] = {}
-        self._waiting = Waiting(info.window)
+        self._waiting = Waiting(info.window, info.lockstep)
         self.counters = Counters()
         self._caller, self._address = Holder(), ""
         audit = audit or Audit()
@@ -233,7 +234,7 @@ class Hub:
         while len(self._inbox):
             arrival = self._heard(self._inbox.first())
             now_s = time.monotonic()
-            received = self._inbox.serve(now_s - last_s)
+            received = self._inbox.serve(min(now_s - last_s, MESSAGE_S))
             self._unread[received.holder.name] -= _size(received)
             if arrival is not None:
                 arrivals.append(arrival)

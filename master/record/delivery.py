@@ -10,6 +10,7 @@ again, and a broken worker must not send it for ever. A message that was damaged
 neither: nothing in it is believed, its number least of all, and what was meant comes again.
 """
 
+import math
 from collections import Counter, OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -162,8 +163,10 @@ class Waiting:
     At most a window of one index, and `MAX_BYTES` of one key.
     """
 
-    def __init__(self, window: int) -> None:
+    def __init__(self, window: int, lockstep: bool = False) -> None:
+        """Nothing waits. In lockstep a whole round must fit, which orders bound."""
         self._window, self._of = window, Counter[tuple[str, int]]()
+        self._most_bytes = math.inf if lockstep else MAX_BYTES
         self._batches, self._bytes = Counter[str](), Counter[str]()  # of a key
 
     def add(self, arrival: EpisodesArrived) -> None:
@@ -177,7 +180,7 @@ class Waiting:
     def room(self, key: tuple[str, int], ledger: Ledger, peers: int) -> int:
         """How many of a process may be held, while so many peers take part."""
         crowd = self._batches[ledger.owner] >= self._window * (peers + SPARE_PEERS)
-        if crowd or self._bytes[ledger.owner] >= MAX_BYTES:
+        if crowd or self._bytes[ledger.owner] >= self._most_bytes:
             return 0
         return self._window - self._of[key] + len(ledger.held)
 

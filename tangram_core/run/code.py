@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from tangram_core.errors import ConfigError
+from tangram_core.errors import ConfigError, OwnCodeError
 
 IMPORTS = "imports"  # setting of any section: modules to import
 KIND = "kind"  # setting of a section that names what it is of: task.kind is given as task
@@ -157,7 +157,7 @@ def load_code(setting: str, given: str, path: Path, name: str, source: bytes) ->
             "be one file that needs nothing but installed packages"
         ) from error
     except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
-        raise ConfigError(f"{setting}={given}: cannot load '{path}': {where(error)}") from error
+        raise OwnCodeError(f"{setting}={given}: cannot load '{path}': {where(error)}") from error
     if not hasattr(module, name):
         raise ConfigError(f"{setting}={given}: '{path}' has no '{name}'")
     return getattr(module, name)
