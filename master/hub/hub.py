@@ -103,7 +103,7 @@ class Hub:
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
         self._askers = defaultdict[str, Askers](Askers)
-        self._inbox, self._unread = FairQueue[Received](), Counter[str]()
+        self._inbox, self._unread = FairQueue[tuple[Received, int]](), Counter[str]()
         self._orders: dict[int, Go] = {}
         self._waiting = Waiting(info.window, info.lockstep)
         self.counters = Counters()
@@ -217,12 +217,12 @@ class Hub:
         """Take what came into the inbox; False if there is more."""
         until_s = time.monotonic() + READ_S
         while (received := self._sockets.receive()) is not None:
-            key, size = received.holder.name, _size(received)
+            key, size = received.holder.name, max(LEAST_BYTES, sum(map(len, received.frames)))
             if self._unread[key] and self._unread[key] + size > INBOX_BYTES:
                 self.counters.note("crowded_out", f"the key '{key}' sends more than can be read")
             else:
                 self._unread[key] += size
-                self._inbox.put(key, received)
+                self._inbox.put(key, (received, size))
             if time.monotonic() >= until_s:
                 return False
         return True
@@ -232,10 +232,11 @@ class Hub:
         arrivals: list[Arrival] = []
         begun_s = last_s = time.monotonic()
         while len(self._inbox):
-            arrival = self._heard(self._inbox.first())
+            received, size = self._inbox.first()
+            arrival = self._heard(received)
             now_s = time.monotonic()
-            received = self._inbox.serve(min(now_s - last_s, MESSAGE_S))
-            self._unread[received.holder.name] -= _size(received)
+            self._inbox.serve(min(now_s - last_s, MESSAGE_S))
+            self._unread[received.holder.name] -= size
             if arrival is not None:
                 arrivals.append(arrival)
             if (last_s := now_s) >= begun_s + SERVE_S:
@@ -417,8 +418,3 @@ class Hub:
         """In lockstep: tell a player, who may have missed it, what is still to play."""
         if peer.role == "player" and peer.index in self._orders:
             self._sockets.answer(peer.identity, self._orders[peer.index])
-
-
-def _size(received: Received) -> int:
-    """Bytes that a message counts for."""
-    return max(LEAST_BYTES, sum(map(len, received.frames)))

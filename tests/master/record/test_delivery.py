@@ -1,10 +1,13 @@
 """Batches of one incarnation: new, seen, missing, too many."""
 
+from typing import cast
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master.record.delivery import Ledger, Verdict
+from master.record.delivery import EpisodesArrived, Ledger, Verdict, Waiting
+from tangram_core.wire.messages import EpisodeBatch
 
 pytestmark = pytest.mark.fast
 
@@ -74,3 +77,13 @@ def test_over_any_losses_each_batch_is_inserted_once_and_in_order(
             ledger, held, inserted = Ledger(1, checkpoint[0]), [], list(checkpoint[1])
         assert sorted(inserted + held) == list(range(1, ledger.received + 1))
         assert ledger.held == set(held)
+
+
+@pytest.mark.parametrize(("lockstep", "room"), [(False, 0), (True, WINDOW - 1)])
+def test_a_round_in_lockstep_has_room_whatever_its_size(
+    monkeypatch: pytest.MonkeyPatch, lockstep: bool, room: int
+) -> None:
+    monkeypatch.setattr("master.record.delivery.MAX_BYTES", 1)
+    waiting, batch = Waiting(WINDOW, lockstep), cast(EpisodeBatch, None)
+    waiting.add(EpisodesArrived("player", 0, 1, batch, [b"xx"]))
+    assert waiting.room(("player", 0), Ledger(1, 0), 1) == room
