@@ -121,7 +121,7 @@ exit "$status"
 
 
 def end_of(
-    folder: Path, role: str, statuses: list[int], sleep: str = ":"
+    folder: Path, role: str, statuses: list[int], sleep: str = ":", **variables: str
 ) -> tuple[int, list[str], list[str]]:
     """Run a script whose commands end like this: its status, its waits, and what they were told."""
     commands, run_dir = folder / ".venv" / "bin", folder / "run"
@@ -134,7 +134,7 @@ def end_of(
     (run_dir / "connection.json").touch()
     (run_dir / "statuses").write_text("".join(f"{status}\n" for status in statuses))
     given = {"PROJECT": str(folder), "RUN_DIR": str(run_dir), "RUN_WITH": ""}
-    command, env = [str(FOLDER / f"{role}.sh"), "seed=1"], os.environ | given
+    command, env = [str(FOLDER / f"{role}.sh"), "seed=1"], os.environ | given | variables
     done = subprocess.run(command, check=False, env=env, capture_output=True, text=True)
     waits = re.findall(r"is started again in (\d+) s$", done.stdout, re.MULTILINE)
     return done.returncode, waits, (run_dir / "told").read_text().splitlines()
@@ -161,3 +161,9 @@ def test_what_the_environment_lacks_is_waited_for_and_wrong_settings_are_not(
 def test_a_time_limit_ends_who_waits(tmp_path: Path, role: str, last: int) -> None:
     status, waited, told = end_of(tmp_path, role, [75, 75, 75, 3], "kill -USR1 $PPID")
     assert (status, waited, len(told)) == (last, ["2"], 1)
+
+
+def test_a_worker_whom_nobody_lets_in_leaves_in_the_end(tmp_path: Path) -> None:
+    """A master that was killed leaves its connection file behind."""
+    status, waited, told = end_of(tmp_path, "worker", [75, 75], PATIENCE_S="0")
+    assert (status, waited, len(told)) == (75, [], 1)
