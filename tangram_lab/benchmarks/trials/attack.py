@@ -57,7 +57,7 @@ def wait_for_updates(most: int, folder: Path, launcher: "subprocess.Popen[bytes]
 
 
 def run_attack(out: Path | None, folder: Path) -> int:
-    """Attack a training, harm another, and compare the score with that of an undisturbed one.
+    """Attack one training, harm others, and compare the score with that of an undisturbed one.
 
     Args:
         out: JSON file.
@@ -79,9 +79,11 @@ def run_attack(out: Path | None, folder: Path) -> int:
             rows = list(tried(BESIEGED, target))
             meanwhile = pool.submit(harmed, folder)
             undisturbed = others.enter_context(started(straight, "max_updates=0", *OURS))
-            rows += tried((*NEIGHBOURS, *LIVE), target)
+            rows += tried(LIVE, target)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         result = result_of(live)
+        with training(folder / "shared", "max_updates=0", *OURS) as target:
+            rows += tried(NEIGHBOURS, target)  # nobody asks for its score: they send what they like
         rows += meanwhile.result()
         wait_for_updates(result["updates"], straight, undisturbed)
     other = result_of(straight)
