@@ -26,7 +26,7 @@ from tangram_lab.benchmarks.trials.target import (
     until,
 )
 
-ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")  # and on the same ever after
+OPEN = ("max_updates=0", "service.bind=127.0.0.1", *OURS)  # until it was attacked enough
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
 UPDATES, LAG = 200, 100  # before the attacks begin
 
@@ -45,6 +45,11 @@ def beside() -> Iterator[ProcessPoolExecutor]:
         finally:
             for process in active_children():
                 process.terminate()
+
+
+def on_a_port() -> str:
+    """A setting: the same one after each restart."""
+    return f"service.port={free_port()}"
 
 
 def wait_for_updates(most: int, folder: Path, launcher: "subprocess.Popen[bytes]") -> None:
@@ -71,8 +76,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
     live, straight = folder / "live", folder / "straight"
     with beside() as pool, ExitStack() as others:
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
-        port = f"service.port={free_port()}"
-        with training(live, "max_updates=0", *ON_A_PORT, port, *OURS, OFTEN) as target:
+        with training(live, *OPEN, on_a_port(), "service.log_format=json", OFTEN) as target:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
             target.goes_on(UPDATES, "updates")
             until(lambda: target.numbers()["lag_updates"] < LAG)  # from what it began with
@@ -82,7 +86,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
             rows += tried(LIVE, target)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         result = result_of(live)
-        with training(folder / "shared", "max_updates=0", *OURS) as target:
+        with training(folder / "shared", *OPEN, on_a_port()) as target:
             rows += tried(NEIGHBOURS, target)  # nobody asks for its score: they send what they like
         rows += meanwhile.result()
         wait_for_updates(result["updates"], straight, undisturbed)
