@@ -18,7 +18,7 @@ from tangram_core.task import Generators, History, Json, Task
 
 Streams = Mapping[str, np.random.Generator]
 Tensors = dict[str, Singles]
-AT_ONCE = 32
+AT_ONCE = 32  # environments that are played at a time where an agent is shown or scored
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +52,7 @@ class Pace:
 
 
 class Actor(ABC):
-    """Who acts in a worker: on the CPU, with one thread, for B environments at a time.
-
-    Attributes:
-        at_once: environments that it plays at a time where it is shown or scored.
-    """
-
-    at_once: int = AT_ONCE
+    """Who acts in a worker: on the CPU, with one thread, for B environments at a time."""
 
     @property
     @abstractmethod

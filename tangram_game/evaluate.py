@@ -85,18 +85,16 @@ def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
 def _rivals(run: Run) -> dict[str, Player]:
     others, agent = dict[str, Player](), run.setup.agent
     if isinstance(agent, Outline):
-        if agent.config.beam > 1:
-            others["beam=1"] = by(run.with_settings({"agent": {"beam": 1}}).actor)
         # Of places that are worth the same the first is taken: that of the largest token.
         others["largest first"] = by(run.unlearned().actor)
     return others | dict(run.setup.task.rivals())
 
 
 def score_policies(
-    task: Task, players: Mapping[str, Player], config: EvalConfig, at_once: int = AT_ONCE
+    task: Task, players: Mapping[str, Player], config: EvalConfig
 ) -> dict[str, Scores]:
     """Scores of each policy, on the same episodes."""
-    with closing(FixedTests(task, config.episodes, at_once, seed=config.seed)) as tests:
+    with closing(FixedTests(task, config.episodes, AT_ONCE, seed=config.seed)) as tests:
         return {name: _scored(tests, player) for name, player in players.items()}
 
 
@@ -116,7 +114,7 @@ def _scored(tests: FixedTests, player: Player) -> Scores:
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Play the test episodes and print the scores; the file's content."""
     task = run.setup.task
-    scores = score_policies(task, policies(run, config.rivals), config, run.actor.at_once)
+    scores = score_policies(task, policies(run, config.rivals), config)
     tests = "fixed tests" if config.seed == 0 else f"tests of seed {config.seed}"
     caption = f"{config.episodes:,} {tests}"
     if isinstance(task, Place):
@@ -131,7 +129,7 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     task = run.task
     figures = find_figures(source, task, names, config.turns)
     players = policies(run, config.rivals)
-    scored = score_puzzles(task, figures, players, config.seed, run.actor.at_once)
+    scored = score_puzzles(task, figures, players, config.seed)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(figures)

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from tangram_agent.runs import Run, load_changed
 from tangram_core import scores
+from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_core.run.code import argument
@@ -77,9 +78,7 @@ def _shown(run: Run, config: PlayConfig) -> str:
     """Write what a task that is not of tokens makes of its episodes; returns what to tell."""
     task, kind = run.setup.task, Path(config.out).suffix
     count = 1 if kind == ".json" else config.episodes
-    with closing(
-        FixedTests(task, count, run.actor.at_once, role="play", seed=config.seed)
-    ) as tests:
+    with closing(FixedTests(task, count, AT_ONCE, role="play", seed=config.seed)) as tests:
         played = tests.play(greedy(run.actor))
     shown = scores.told(task.scores[: scores.SHOWN], task.score(played))
     line = f"{plural(count, 'episode')}, {shown}"
@@ -120,7 +119,7 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
 def play_episodes(run: Run, config: PlayConfig) -> Played:
     """The episodes that the settings name, played by a run."""
     with closing(
-        FixedTests(run.task, config.episodes, run.actor.at_once, role="play", seed=config.seed)
+        FixedTests(run.task, config.episodes, AT_ONCE, role="play", seed=config.seed)
     ) as tests:
         return Played.of(tests.play(greedy(run.actor)))
 
@@ -139,7 +138,7 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
             f"there are {len(figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
             f"in puzzle=[{figures[0].name}]"
         )
-    played = play_figures(task, figures, by(run.actor), config.seed, at_once=run.actor.at_once)
+    played = play_figures(task, figures, by(run.actor), config.seed)
     return Show(task, played, [one.title for one in figures], "puzzle")
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Bools, Floats
 from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_sim.rewards import scaled_overlap
@@ -47,17 +46,10 @@ class Scored:
 
 
 def score_puzzles(
-    task: Place,
-    figures: Sequence[Figure],
-    players: Mapping[str, Player],
-    seed: int,
-    at_once: int = AT_ONCE,
+    task: Place, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
 ) -> Scored:
     """Scores of each policy on the same starts; who sees outlines fills them itself."""
-    played = {
-        name: play_figures(task, figures, player, seed, at_once=at_once)
-        for name, player in players.items()
-    }
+    played = {name: play_figures(task, figures, player, seed) for name, player in players.items()}
     scores = {name: _of_puzzles(task, own) for name, own in played.items()}
     run, titles = played[RUN], [figure.title for figure in figures]
     told = "positions in arena units"

@@ -8,8 +8,7 @@ Legend: K tokens, V corners, N rings.
 
 import base64
 import json
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +19,6 @@ from PIL import Image
 
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
-from tangram_game.figures.methods import together
 from tangram_game.figures.puzzles import check_inside
 from tangram_sim.drawing.strokes import colour_of
 from tangram_sim.geometry.areas import Area, polygons
@@ -32,7 +30,7 @@ from tangram_studio.playing import Sides, player
 from tangram_vision.given.outline_files import FORMAT, VERSION
 from tangram_vision.given.picture_files import READ
 from tangram_vision.given.silhouette_files import Silhouette
-from tangram_vision.silhouettes.silhouettes import Method, silhouette
+from tangram_vision.silhouettes.silhouettes import silhouette
 from tangram_vision.solution import Solution
 from tangram_vision.solving import SECONDS, answer
 from tangram_vision.solving import Answer as Answered
@@ -85,7 +83,7 @@ def fill(asked: Fill) -> Answer:
     layout, scale = player().layout, player().run.task.tokens.scale
     if asked.puzzle is not None:
         load_puzzle(asked.puzzle)  # a name of the library, not of a file
-        return _filled(asked.puzzle, "the puzzle", asked.who)
+        return _filled(asked.puzzle, "the puzzle")
     content = {"format": FORMAT, "version": VERSION, "outlines": asked.outlines}
     if asked.pieces is not None:
         poses, flipped = asked.pieces.sides
@@ -99,16 +97,15 @@ def fill(asked: Fill) -> Answer:
         path = Path(folder) / "drawing.json"
         path.write_text(json.dumps(content), encoding="utf-8")
         source = "the drawing" if asked.pieces is None else LAYOUT
-        return _filled(str(path), source, asked.who, asked.free)
+        return _filled(str(path), source, asked.free)
 
 
-def fill_file(name: str, data: bytes, who: str) -> Answer:
+def fill_file(name: str, data: bytes) -> Answer:
     """Fill what a file shows: a picture, an SVG, outlines or a puzzle as JSON.
 
     Args:
         name: of the file; only its ending matters.
         data: its content.
-        who: see `Fill`.
 
     Raises:
         ConfigError: it cannot be used.
@@ -122,7 +119,7 @@ def fill_file(name: str, data: bytes, who: str) -> Answer:
     with TemporaryDirectory(prefix="tangram-studio-") as folder:
         path = Path(folder) / f"file{suffix}"
         path.write_bytes(data)
-        return _filled(str(path), "the file", who)
+        return _filled(str(path), "the file")
 
 
 def tans() -> dict[str, object]:
@@ -152,30 +149,20 @@ def tans() -> dict[str, object]:
     }
 
 
-def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
+def _filled(name: str, source: str, free: bool = False) -> Answer:
     task = player().run.task
     seconds = FREE_SECONDS if free else SECONDS
-    found = answer(name, source, task.layout, task.tokens.scale, seconds, method=_method(who))
+    found = answer(name, source, task.layout, task.tokens.scale, seconds)
     if source == LAYOUT and found.drawn.share is not None:
         raise ConfigError("the tans lie on each other: move them apart")
     first = found.drawn.filled
     how = f"{source[0].upper()}{source[1:]} {found.told.partition(';')[0]}."
     if found.exact:
-        how = f"filled by the {_called(who, first.by)} in {first.seconds:.2f} s"
+        how = f"filled by the {first.by} in {first.seconds:.2f} s"
     elif free:
         how = "Drawn by a free hand."
     solution = found.solution(task.layout, task.tokens.scale, source.removeprefix("the "))
     return _answer(found, how, solution)
-
-
-@lru_cache(maxsize=2)
-def _method(who: str) -> Method:
-    method = together(player().layout)
-    return replace(method, search=False) if who == "agent" else method
-
-
-def _called(who: str, by: str) -> str:
-    return "agent alone" if who == "agent" else {"beam": "agent, looking ahead"}.get(by, by)
 
 
 def _answer(answered: Answered, how: str, solution: Solution) -> Answer:

@@ -22,7 +22,6 @@ Count = Annotated[int, Meta(ge=0, lt=2**53)]
 Point = tuple[Number, Number]
 Ring = Annotated[list[Point], Meta(min_length=3, max_length=MAX_POINTS)]
 Motion = Literal["lift", "push"]
-Who = Literal["together", "agent"]
 
 
 class Tokens(Struct, forbid_unknown_fields=True):
@@ -51,7 +50,6 @@ class Fill(Struct, tag_field="ask", tag="fill", forbid_unknown_fields=True):
         outlines: of a drawing, in any unit; an outline within another is a hole.
         pieces: of a figure that was laid of tans, whose area is known.
         free: the outlines were drawn by a free hand.
-        who: fills it: the search and then the agent, or the agent alone.
     """
 
     number: Count
@@ -59,7 +57,6 @@ class Fill(Struct, tag_field="ask", tag="fill", forbid_unknown_fields=True):
     outlines: Annotated[list[Ring], Meta(min_length=1, max_length=50)] | None = None
     pieces: Tokens | None = None
     free: bool = False
-    who: Who = "together"
 
 
 class Play(Struct, tag_field="ask", tag="play", forbid_unknown_fields=True):

@@ -253,10 +253,8 @@ class Studio:
 
     async def _seen(self, request: Request, data: bytes) -> Response:
         """How a file is filled, unless its sender leaves."""
-        name, who = (request.query_params.get(key, "") for key in ("name", "who"))
-        if who not in ("together", "agent"):
-            return _refused("who must be together or agent", 400)
-        looks = asyncio.create_task(self.fills.do(fill_file, name, data, who))
+        name = request.query_params.get("name", "")
+        looks = asyncio.create_task(self.fills.do(fill_file, name, data))
         leaves = asyncio.create_task(_left(request))
         await asyncio.wait((looks, leaves), return_when=asyncio.FIRST_COMPLETED)
         leaves.cancel()

@@ -8,7 +8,6 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.targets import has_all_tans
 from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
 from tangram_vision.silhouettes.approximations import nearest_figure
-from tangram_vision.silhouettes.silhouettes import UNLEARNED, Method
 from tangram_vision.silhouettes.tilts import mapped
 from tangram_vision.solution import Picture, Solution, tokens_of
 
@@ -51,12 +50,7 @@ class Answer:
 
 
 def answer(
-    name: str,
-    source: str,
-    layout: Layout,
-    scale: float,
-    seconds: float = SECONDS,
-    method: Method = UNLEARNED,
+    name: str, source: str, layout: Layout, scale: float, seconds: float = SECONDS
 ) -> Answer:
     """Fill a figure, or come near to it with all tokens; see `fill_silhouette`.
 
@@ -64,7 +58,7 @@ def answer(
         ConfigError: a file that cannot be used.
     """
     begin = time.thread_time()
-    drawn = fill_silhouette(name, source, layout, scale, seconds, method)
+    drawn = fill_silhouette(name, source, layout, scale, seconds)
     filled = drawn.filled
     if filled.found is not None and filled.solved:
         told = f"filled by the {filled.by} in {filled.seconds:.2f} s, IoU {filled.iou:.3f}"

@@ -173,7 +173,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
 # What shows elsewhere, and where.
 ELSEWHERE = {
     "agent.name": "the label of a run in reports",
-    "agent.beam": "tests/agent/agents/outline/test_filler.py: a beam finds what values do not tell",
     "task.id": "tests/tasks/test_gym.py: it is made, or refused by name",
     "task.imports": "tests/cluster/test_own_code.py: a module that is not there is named",
     "task.hand": "tests/tasks/test_push_shown.py: the arm pushes as the finger does",

@@ -78,12 +78,7 @@ def by(actor: Actor) -> Player:
 
 
 def play_figures(
-    task: Place,
-    figures: Sequence[Figure],
-    player: Player,
-    seed: int,
-    touching: bool = True,
-    at_once: int = AT_ONCE,
+    task: Place, figures: Sequence[Figure], player: Player, seed: int, touching: bool = True
 ) -> Played:
     """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
 
@@ -93,7 +88,6 @@ def play_figures(
         player: moves them.
         seed: of the starts.
         touching: whether their pieces touch, so that no picture tells them apart.
-        at_once: most that are played at a time.
 
     Raises:
         ConfigError: pictures are to be observed, and pieces touch; or silhouettes are.
@@ -109,7 +103,7 @@ def play_figures(
     sim = task.sim if shows else task.sim.blind
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     shown = replace(task, sim=sim, reward=RewardConfig())
-    with closing(shown.make(min(at_once, len(figures)))) as env:
+    with closing(shown.make(min(AT_ONCE, len(figures)))) as env:
 
         def generator(number: int) -> np.random.Generator:
             return _generator(figures[number], seed)

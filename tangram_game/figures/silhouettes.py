@@ -61,15 +61,13 @@ def answered(name: str, source: str, task: Place) -> "Answer":
     """
     try:
         # Only here: other targets need neither.
-        from tangram_game.figures.methods import together  # noqa: PLC0415
         from tangram_vision import solving  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError(
             f"{source} needs OpenCV and shapely ({error}): install opencv-python-headless and "
             "shapely, or name a puzzle, as in puzzle=cat"
         ) from error
-    layout, method = task.layout, together(task.layout)
-    return solving.answer(name, source, layout, task.tokens.scale, solving.SECONDS, method)
+    return solving.answer(name, source, task.layout, task.tokens.scale, solving.SECONDS)
 
 
 def read_silhouette(name: str, source: str, task: Place) -> Shown:

@@ -37,7 +37,7 @@ MAX_BYTES = 1_000_000  # of the weights: they travel with every installation
 FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of each figure
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
 # What an agent looks ahead by as it ships, and does not in training.
-AHEAD = {"outline": {"beam": 12}, "push": {"tried": 16}}
+AHEAD = {"push": {"tried": 16}}
 DEAR = ("table", "planner", "planner_told", "planner_wrong")  # rivals that would take hours
 
 
@@ -81,7 +81,7 @@ def publish(
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
     players = {name: one for name, one in policies(chosen.run).items() if name not in DEAR}
     task = chosen.run.setup.task
-    scores = score_policies(task, players, config, chosen.run.actor.at_once)
+    scores = score_policies(task, players, config)
     card = make_card(name, chosen, seeds)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
     places = isinstance(task, Place) and task.sim.observe != "pictures"  # pieces that touch
@@ -100,7 +100,7 @@ def publish(
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
     figures = find_figures(split, run.task, None, TURNS)
-    scored = score_puzzles(run.task, figures, {RUN: by(run.actor)}, TEST_SEED, run.actor.at_once)
+    scored = score_puzzles(run.task, figures, {RUN: by(run.actor)}, TEST_SEED)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 

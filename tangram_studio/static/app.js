@@ -214,7 +214,7 @@ class Studio {
 
   fill(what) {
     this.look("it");
-    this.last = { ask: "fill", number: this.number, who: $("who").value, ...what };
+    this.last = { ask: "fill", number: this.number, ...what };
     this.send(this.last);
   }
 
@@ -238,7 +238,7 @@ class Studio {
     }
     this.name = file.name.replace(/\.[^.]*$/, "").replace(/[^A-Za-z0-9_-]+/g, "_").slice(0, 40) || "file";
     this.dropping = new AbortController();
-    const query = new URLSearchParams({ name: file.name, who: $("who").value });
+    const query = new URLSearchParams({ name: file.name });
     const answer = await fetch(`api/drop?${query}`, { method: "POST", body: file, signal: this.dropping.signal }).catch(() => null);
     const content = await answer?.json().catch(() => null);
     if (own !== this.number) return;
@@ -420,7 +420,6 @@ class Studio {
     $("motion").addEventListener("change", () => {
       if (this.goal && !this.looking) this.play(this.over ? null : this.board.scene);
     });
-    $("who").addEventListener("change", () => this.say("That is for the next figure."));
     for (const kind of ["gif", "svg", "json"]) $(`save-${kind}`).addEventListener("click", () => this.save(kind));
     $("file").addEventListener("change", () => {
       this.drop($("file").files[0]);

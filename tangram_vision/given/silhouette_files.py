@@ -26,12 +26,7 @@ from tangram_vision.given.outline_files import Drawn, read_outline
 from tangram_vision.given.photos import Shade, find_silhouette
 from tangram_vision.given.picture_files import Given, read_picture
 from tangram_vision.silhouettes.silhouette_pictures import fill_picture
-from tangram_vision.silhouettes.silhouettes import (
-    UNLEARNED,
-    Filled,
-    Method,
-    fill_outline,
-)
+from tangram_vision.silhouettes.silhouettes import Filled, fill_outline
 from tangram_vision.silhouettes.tilts import mapped, shift
 
 _DRAWN = 640  # pixels along the longer side of an outline that is drawn
@@ -71,12 +66,7 @@ class Silhouette:
 
 
 def fill_silhouette(
-    name: str,
-    source: str,
-    layout: Layout,
-    scale: float,
-    seconds: float,
-    method: Method = UNLEARNED,
+    name: str, source: str, layout: Layout, scale: float, seconds: float
 ) -> Silhouette:
     """Read a silhouette and fill it.
 
@@ -86,27 +76,24 @@ def fill_silhouette(
         layout: the tokens.
         scale: side of the full square that they are cut from, in their units.
         seconds: for the search.
-        method: how it is filled.
 
     Raises:
         ConfigError: a file that cannot be used; whether it was filled is not checked.
     """
     path = Path(name)
     if path.suffix.lower() in ("", ".json"):
-        return _from_outline(read_outline(name, source), layout, scale, seconds, method)
-    return _from_picture(read_picture(path, source), source, layout, seconds, method)
+        return _from_outline(read_outline(name, source), layout, scale, seconds)
+    return _from_picture(read_picture(path, source), source, layout, seconds)
 
 
-def _from_outline(
-    drawn: Drawn, layout: Layout, scale: float, seconds: float, method: Method
-) -> Silhouette:
+def _from_outline(drawn: Drawn, layout: Layout, scale: float, seconds: float) -> Silhouette:
     """Scaled to the tokens' area, filled, and drawn."""
     area, total = drawn.area, float(layout.areas.sum())
     own = float(np.sqrt(total / area.area))
     share = None if drawn.side is None else float(area.area * (scale / drawn.side) ** 2 / total)
     wrong = share is not None and abs(share - 1.0) > _OFF
     placed, size, unit = _framed(area, own)
-    filled = fill_outline(placed, layout, seconds, method)
+    filled = fill_outline(placed, layout, seconds)
     mask = _mask(placed, size, unit)
     drawing = np.diag([unit, -unit, 1.0])
     told = share if wrong else None
@@ -143,9 +130,7 @@ def _inked(mask: Bools) -> Image.Image:
     return Image.fromarray(np.where(mask[..., None], _INK, _PAPER).astype(np.uint8))
 
 
-def _from_picture(
-    given: Given, source: str, layout: Layout, seconds: float, method: Method
-) -> Silhouette:
+def _from_picture(given: Given, source: str, layout: Layout, seconds: float) -> Silhouette:
     """The scale is that at which as many pixels are covered as the tokens are large."""
     shade = _closed(find_silhouette(given.picture, layout, source))
     if not (shade.cover > 0.5).any():
@@ -154,7 +139,7 @@ def _from_picture(
         )
     share = float(shade.cover.sum()) / shade.cover.size
     view = float(np.sqrt(layout.areas.sum() / share))
-    filled = fill_picture(shade.cover, layout, view, seconds, method)
+    filled = fill_picture(shade.cover, layout, view, seconds)
     drawing = shade.back @ np.diag([1.0 / view, -1.0 / view, 1.0])
     area = _traced(shade.cover, view / len(shade.cover))
     mask = _shaded(shade, given.picture.size)

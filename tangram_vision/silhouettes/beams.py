@@ -6,8 +6,8 @@ states that are worth most are followed.
 Legend: n states, S different shapes.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,12 +16,8 @@ from tangram_sim.geometry.areas import Area, valid
 from tangram_sim.geometry.dissections import Budget, Laid, Tokens, less, without
 from tangram_vision.silhouettes.loose import LoosePlaces
 
-# (what is left to fill, and how many tokens of each shape, of n states) -> (n,) how surely these
-# fill that, as logits.
-Values: TypeAlias = Callable[[Sequence[Area], Sequence[tuple[int, ...]]], Floats]
-
-_SIZE = 0.25  # value of a token as large as the smallest one
-_UNSEEN = -20.0  # value of what is not judged
+WIDTH = 12  # states of each depth that are followed
+_SIZE = 0.25  # value of a token as large as the smallest one, where 1 is its area reaching out
 
 
 class State(NamedTuple):
@@ -41,17 +37,14 @@ class State(NamedTuple):
 
 
 class Beam:
-    """Lays tokens in one outline after another, the states of most worth at a time."""
+    """Lays tokens in one outline after another, following the states of most worth.
 
-    def __init__(self, tokens: Tokens, width: int, values: Values | None = None) -> None:
-        """Follow so many states.
+    A state is worth the more, the larger the tokens that lie and the less they reach out.
+    """
 
-        Args:
-            tokens: that are laid.
-            width: states of each depth that are followed.
-            values: what states are worth; None: the more, the larger the tokens that lie.
-        """
-        self._tokens, self._width, self._values = tokens, width, values
+    def __init__(self, tokens: Tokens, width: int = WIDTH) -> None:
+        """Follow so many states of each depth."""
+        self._tokens, self._width = tokens, width
         self._least = float(tokens.areas.min())
 
     def run(
@@ -86,12 +79,9 @@ class Beam:
     def _worth(self, states: Sequence[State]) -> Floats:
         if not states:
             return np.zeros(0)
-        over = np.array([state.over for state in states]) / self._least
-        if self._values is None:
-            left: Floats = np.array([state.left for state in states]) @ self._tokens.areas
-            return np.asarray(-_SIZE * left / self._least - over)
-        rests, left_of = [state.rest for state in states], [state.left for state in states]
-        return np.maximum(self._values(rests, left_of), _UNSEEN) - over
+        over = np.array([state.over for state in states])
+        left = np.array([state.left for state in states]) @ self._tokens.areas
+        return np.asarray(-(_SIZE * left + over) / self._least)
 
     def _next(self, state: State, places: LoosePlaces, tolerance: float) -> list[State]:
         """What may follow a state."""

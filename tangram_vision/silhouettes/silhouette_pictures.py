@@ -34,9 +34,7 @@ from tangram_vision.silhouettes.outlines import WAYS, Way, outline
 from tangram_vision.silhouettes.silhouettes import (
     SOLVED,
     TOLERANCES,
-    UNLEARNED,
     Filled,
-    Method,
     nearest_fill,
     pieces,
 )
@@ -71,9 +69,7 @@ class _Explained:
     by: str
 
 
-def fill_picture(
-    cover: Singles, layout: Layout, view: float, seconds: float, method: Method = UNLEARNED
-) -> Filled:
+def fill_picture(cover: Singles, layout: Layout, view: float, seconds: float) -> Filled:
     """The dissection that explains a picture's coverage (P, P) best.
 
     Args:
@@ -81,11 +77,10 @@ def fill_picture(
         layout: the tokens.
         view: width of the picture, in the units of the layout.
         seconds: for all of it.
-        method: how.
     """
     begin, unit = time.thread_time(), view / len(cover)
     crop, corner = _cropped(cover)
-    explainer = _Explainer(crop, layout, kinds_of(layout, view, len(cover)), unit, method)
+    explainer = _Explainer(crop, layout, kinds_of(layout, view, len(cover)), unit)
     explainer.run(Budget(begin + _SHARE * seconds))
     best, nodes = explainer.best, explainer.budget.taken
     if best is not None:
@@ -93,7 +88,7 @@ def fill_picture(
         found = _moved(best.found, corner * unit)
         return Filled(found, iou, time.thread_time() - begin, nodes, False, by=best.by)
     area, late = explainer.outlined(WAYS[0]), Budget(begin + seconds)
-    laid, iou = nearest_fill(area, layout, late, explainer.attempts, method)
+    laid, iou = nearest_fill(area, layout, late, explainer.attempts)
     attempt = None if laid is None else _moved(laid, corner * unit)
     return Filled(None, iou, time.thread_time() - begin, nodes, False, attempt)
 
@@ -112,13 +107,11 @@ class _Explainer:
         budget: what was used of it.
     """
 
-    def __init__(
-        self, cover: Singles, layout: Layout, kinds: Sequence[Kind], unit: float, method: Method
-    ) -> None:
+    def __init__(self, cover: Singles, layout: Layout, kinds: Sequence[Kind], unit: float) -> None:
         """Of coverage (P, P), pixels of so many units of the layout."""
         self._cover, self._layout, self._kinds, self._unit = cover, layout, kinds, unit
-        self._tokens, self._method = Tokens(layout), method
-        self._beam = Beam(self._tokens, method.width, method.values)
+        self._tokens = Tokens(layout)
+        self._beam = Beam(self._tokens)
         self.best: _Explained | None = None
         self.attempts: list[list[Laid]] = []
         self.budget = Budget(0.0)
@@ -128,7 +121,7 @@ class _Explainer:
         self.budget = budget
         for way in WAYS:
             area, before = self.outlined(way), self.best
-            if self._method.search and self._search(area):
+            if self._search(area):
                 return
             if self._lay(area, (), self._tokens.counts, _ROUGH):
                 return

@@ -18,7 +18,7 @@ from tangram_sim.geometry.dissections import Budget, Dissection, Laid, Search, T
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines
 from tangram_sim.geometry.rings import covered_area, unit_of
-from tangram_vision.silhouettes.beams import Beam, Values
+from tangram_vision.silhouettes.beams import Beam
 
 # Of the root of all tokens' area, the full square's side where they are the tans.
 TOLERANCES = (0.004, 0.008, 0.014, 0.022, 0.035, 0.05, 0.07, 0.09)
@@ -29,24 +29,6 @@ _ROUND = 1e-9  # of the tokens' size, to which corners are rounded
 _STRAIGHT, _GRID = 1e-4, 1e-6
 _SHARE = 0.9  # of the time, for the search; the rest is for the best attempt
 _LOOSE = (0.004, 0.022, 0.05)  # tolerances of a beam, for outlines
-
-
-@dataclass(frozen=True, eq=False)
-class Method:
-    """How silhouettes are filled.
-
-    Attributes:
-        search: whether by a search, which goes back where it is stuck.
-        width: states that a beam follows where no search has found anything.
-        values: what ranks these; None: the area of the tokens that lie.
-    """
-
-    search: bool = True
-    width: int = 12
-    values: Values | None = None
-
-
-UNLEARNED = Method()  # the search, then a beam of the largest tokens
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +95,7 @@ def silhouette(layout: Layout, laid: Dissection) -> Area:
     return shapely.normalize(shapely.union_all(parts))
 
 
-def fill_outline(area: Area, layout: Layout, seconds: float, method: Method = UNLEARNED) -> Filled:
+def fill_outline(area: Area, layout: Layout, seconds: float) -> Filled:
     """A dissection of an outline of the tokens' area, or an attempt.
 
     The search is complete, so that what a beam lays after it is no more than an attempt.
@@ -122,11 +104,10 @@ def fill_outline(area: Area, layout: Layout, seconds: float, method: Method = UN
         area: in the units of the layout.
         layout: its tokens.
         seconds: for all of it.
-        method: how.
     """
     tokens, begin = Tokens(layout), time.thread_time()
     budget, tried = Budget(begin + _SHARE * seconds), list[list[Laid]]()
-    for tolerance in TOLERANCES if method.search else ():
+    for tolerance in TOLERANCES:
         search = Search(tokens, tolerance * tokens.unit, budget)
         for laid in search.run(area):
             found = dissection(tokens, laid)
@@ -137,23 +118,17 @@ def fill_outline(area: Area, layout: Layout, seconds: float, method: Method = UN
         tried.append(search.best)
         if budget.spent():
             break
-    loose = Budget(begin + seconds)
-    nearest, iou = nearest_fill(area, layout, loose, tried, method)
-    passed = time.thread_time() - begin
-    if method.search:
-        complete = not budget.spent()
-        return Filled(None, iou, passed, budget.taken, complete, nearest)
-    if nearest is not None and nearest.lies is None and iou >= SOLVED:
-        return Filled(nearest, iou, passed, loose.taken, False, by="beam")
-    return Filled(None, iou, passed, loose.taken, False, nearest)
+    complete = not budget.spent()
+    nearest, iou = nearest_fill(area, layout, Budget(begin + seconds), tried)
+    return Filled(None, iou, time.thread_time() - begin, budget.taken, complete, nearest)
 
 
 def nearest_fill(
-    area: Area, layout: Layout, budget: Budget, tried: Sequence[list[Laid]], method: Method
+    area: Area, layout: Layout, budget: Budget, tried: Sequence[list[Laid]]
 ) -> tuple[Dissection | None, float]:
     """What comes nearest to an outline, of what was tried and of beams; and its IoU."""
     tokens, every = Tokens(layout), [*tried]
-    beam = Beam(tokens, method.width, method.values)
+    beam = Beam(tokens)
     for tolerance in _LOOSE:
         states = beam.run(area, tokens.counts, tolerance * tokens.unit, budget)
         every += [list(state.laid) for state in states[:1]]

@@ -57,8 +57,14 @@ def with_sections(config: dict[str, Any], more: dict[str, Any]) -> dict[str, dic
         (changed("task", kind="x"), "task.kind=x: there is no such task: choose from place, fill"),
         (changed("task", odd=1), "there is no setting task.odd: delete it"),
         (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
-        (changed("agent", kind="outline", beam=0), "agent.beam must be between 1 and 32, got 0"),
-        (changed("agent", beam=2), "there is no setting agent.beam: delete it; .* older version"),
+        (
+            changed("agent", kind="outline", copies=0),
+            "agent.copies must be between 1 and 64, got 0",
+        ),
+        (
+            changed("agent", copies=2),
+            "there is no setting agent.copies: delete it; .* older version",
+        ),
         (changed("agent", hindsight=[{"strategy": "x"}]), "must be one of final, future, near"),
         (
             changed("agent", hindsight=[{"strategy": "near", "copies": 0}]),

@@ -46,7 +46,7 @@ class Running(NamedTuple):
 
     def drop(self, name: str, data: bytes) -> tuple[int, dict[str, Any]]:
         """What is answered to a file."""
-        path = f"/api/drop?name={name}&who=together"
+        path = f"/api/drop?name={name}"
         status, _, body = self.get(path, "POST", data)
         return status, json.loads(body)
 

@@ -83,10 +83,6 @@ WRONG = [
     ("tangram-train sed=1", "unknown setting 'sed' (did you mean 'seed'?)"),
     ("tangram-train noise=1", "unknown setting 'noise' (did you mean 'agent.noise'?)"),
     ("tangram-train agent.gama=0", "unknown setting 'agent.gama' (did you mean 'agent.gamma'?)"),
-    (
-        "tangram-train task=fill tokens=tangram7 agent=outline agent.beam=12",
-        "agent.beam=12 is for play, an evaluator would be silent for minutes: leave it",
-    ),
     ("tangram-train sim.observe=silhouette", "is for an agent of outlines: train one"),
     ("tangram-train +~zzz", "cannot read '+~zzz'"),
     ("tangram-train zzz=1", "unknown setting 'zzz' (--help and --cfg job list them)"),

@@ -48,7 +48,7 @@ def test_strangers_are_served_nothing(running: Running, path: str) -> None:
         assert key or told in body  # a socket is told the status alone
         assert "set-cookie" not in headers
         assert running.token.encode() not in body
-    assert running.get("/api/drop?name=a.png&who=agent", "POST", b"x" * 100, Cookie="")[0] == 403
+    assert running.get("/api/drop?name=a.png", "POST", b"x" * 100, Cookie="")[0] == 403
 
 
 def test_the_token_becomes_a_cookie_and_leaves_the_address(running: Running) -> None:
@@ -114,7 +114,7 @@ def test_a_file_that_is_not_filled_is_refused_in_one_line(running: Running) -> N
 def head_of(running: Running, length: int) -> bytes:
     """The head of an upload of so many bytes."""
     return (
-        f"POST /api/drop?name=a.png&who=together HTTP/1.1\r\nHost: 127.0.0.1:{running.port}\r\n"
+        f"POST /api/drop?name=a.png HTTP/1.1\r\nHost: 127.0.0.1:{running.port}\r\n"
         f"Cookie: {running.cookie}\r\nContent-Length: {length}\r\n\r\n"
     ).encode()
 
@@ -123,7 +123,7 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(running: Running)
     with socket.create_connection(("127.0.0.1", running.port), timeout=WAIT_S) as raw:
         raw.sendall(head_of(running, MAX_UPLOAD + 1))  # and not a byte of it
         assert raw.recv(4096).startswith(b"HTTP/1.1 413")
-    path = "/api/drop?name=a.png&who=agent"
+    path = "/api/drop?name=a.png"
     status, _, body = running.get(path, "POST", iter([b"x"]))
     assert (status, b"larger than 10 MB" in body) == (413, True)  # of a length that is not told
 

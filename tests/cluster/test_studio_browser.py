@@ -188,11 +188,9 @@ def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
 
 
 @pytest.mark.check
-def test_tans_are_pushed_too_and_the_agent_fills_alone(page: Page) -> None:
+def test_tans_are_pushed_too(page: Page) -> None:
     page.locator("#motion").select_option("push")
-    page.locator("#who").select_option("agent")
     page.locator("[data-figure=cat]").click()
-    expect(page.locator("#told")).to_contain_text("agent alone")
     moving(page)
     assert page.evaluate("studio.board.move.frames.length") == 21
     expect(page.locator(".finger")).to_be_visible()

@@ -10,10 +10,7 @@ import pytest
 from PIL import Image
 
 import tangram_game.show.film as film_module
-from tangram_agent.agents.outline.filler import Filler
-from tangram_agent.base.types import Choice
 from tangram_agent.runs import load_changed, load_run
-from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_game.config import PlayConfig
 from tangram_game.play import (
@@ -178,22 +175,6 @@ def test_without_pyav_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
 
 
 # Puzzles, and random targets of several tokens
-
-
-def test_what_looks_ahead_plays_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-
-    def stays(_: Filler, corners: Floats, *_more: object) -> Choice:
-        asked.append(len(corners))
-        none = np.zeros(len(corners), np.int64)
-        return Choice(none, none > 0, np.zeros((len(corners), 3), np.float32))
-
-    monkeypatch.setattr(Filler, "choose", stays)
-    run = load_run("pretrained/tangram7_silhouette")
-    assert run.setup.agent.config.beam == 12
-    for what in ({"episodes": 2}, {"puzzle": ("cat", "heart")}):
-        make_show(run, PlayConfig(str(run.folder), **what))
-    assert asked == [1] * 4 * run.task.horizon
 
 
 def test_puzzles_by_name_start_beside_their_figures_and_elsewhere_with_another_seed(

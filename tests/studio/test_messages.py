@@ -20,7 +20,7 @@ SAVE = {"ask": "save", "kind": "gif", "tokens": TOKENS}
     ("message", "kind"),
     [
         (FILL | {"puzzle": "cat"}, Fill),
-        (FILL | {"outlines": [RING], "free": True, "who": "agent"}, Fill),
+        (FILL | {"outlines": [RING], "free": True}, Fill),
         (FILL | {"pieces": TOKENS}, Fill),
         (PLAY | {"start": TOKENS, "motion": "push"}, Play),
         ({"ask": "next"}, Next),
@@ -52,7 +52,6 @@ def test_what_a_page_asks_for_is_read(message: dict[str, object], kind: type) ->
         json.dumps(FILL | {"outlines": [[[0.0, 101.0], *RING]]}),
         json.dumps(FILL | {"outlines": [[[0.0, float("nan")], *RING]]}),
         json.dumps(FILL | {"outlines": [[[0.0, float("inf")], *RING]]}),
-        json.dumps(FILL | {"puzzle": "cat", "who": "me"}),
         json.dumps(PLAY | {"motion": "throw"}),
         json.dumps(PLAY | {"goal": TOKENS | {"poses": [[0.0, 0.0, 0.0]] * 6}}),
         json.dumps(PLAY | {"goal": TOKENS | {"flipped": [0] * 7}}),

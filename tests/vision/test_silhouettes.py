@@ -21,7 +21,7 @@ from tangram_sim.world.world import make_world
 from tangram_vision.pictures.kinds import kinds_of
 from tangram_vision.silhouettes.outlines import WAYS, Way, outline
 from tangram_vision.silhouettes.silhouette_pictures import _cropped, _Explainer, fill_picture
-from tangram_vision.silhouettes.silhouettes import Filled, Method, covered
+from tangram_vision.silhouettes.silhouettes import Filled, covered
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
@@ -124,10 +124,11 @@ def test_tokens_that_lie_wrong_are_laid_anew(monkeypatch: pytest.MonkeyPatch) ->
             return lay(self, area, kept, *rest)
         return self._offer([self._laid(wrong, k) for k in range(7)], "beam")
 
+    monkeypatch.setattr(_Explainer, "_search", lambda *_: False)
     monkeypatch.setattr(_Explainer, "_lay", offered)
     for tried in (0, 12):
         monkeypatch.setattr("tangram_vision.silhouettes.silhouette_pictures._TRIED", tried)
-        iou.append(fill_picture(cover, LAYOUT, ARENA, 20.0, Method(search=False)).iou)
+        iou.append(fill_picture(cover, LAYOUT, ARENA, 20.0).iou)
     assert iou[0] < 0.95
     assert iou[1] > 0.97
 
@@ -136,7 +137,7 @@ def test_what_explains_a_picture_worse_is_forgotten(monkeypatch: pytest.MonkeyPa
     cover, truth = rough(1, 128)
     crop, corner = _cropped(cover)
     unit = ARENA / 128
-    explainer = _Explainer(crop, LAYOUT, kinds_of(LAYOUT, ARENA, 128), unit, Method())
+    explainer = _Explainer(crop, LAYOUT, kinds_of(LAYOUT, ARENA, 128), unit)
     poses = truth.poses + (ARENA / 2.0, -ARENA / 2.0, 0.0) - (*corner * unit, 0.0)
     off = poses + np.array([(0.1 * (k == 0), 0.0, 0.8 * (k == 0)) for k in range(7)])
     for own, alike in ((off, False), (poses, True), (off, True)):

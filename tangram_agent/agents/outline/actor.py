@@ -25,9 +25,7 @@ class OutlineActor(NetworkActor):
     def __init__(self, task: Fill, config: OutlineConfig, net: NetConfig) -> None:
         super().__init__(OutlineValue(Filling(task.layout).shapes, net))
         self._task, self._config = task, config
-        self._filler = Filler(self.network, task, config.beam)
-        if config.beam > 1:  # plans of many take gigabytes, and save a tenth of the time
-            self.at_once = 1
+        self._filler = Filler(self.network, task)
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
         """Actions (B, A) on outlines (B, G, 2); where it explores a share of them goes anywhere."""

@@ -19,13 +19,6 @@ if TYPE_CHECKING:  # need torch
 class OutlineConfig(LearningConfig, section="agent"):
     """Q-learning over afterstates, with hindsight."""
 
-    beam: int = setting(
-        1,
-        "exploration off: lay all tokens in thought first, and follow so many fillings of each "
-        "depth, by the values of what would be left; 1: play what is best now",
-        low=1,
-        high=32,
-    )
     polyak: float = setting(0.99, "rho of the target network, Eq. 4", low=0, high=1, part=LEARNING)
     copies: int = setting(6, "states of hindsight for each episode", low=1, high=64, part=LEARNING)
 
@@ -47,14 +40,9 @@ class Outline(TokenAgent):
         super().check(task)
 
     def check_training(self, *, compiled: bool = False) -> None:
-        """Refuse what is for play alone, and to compile."""
+        """Refuse to compile."""
         if compiled:
             refuse_ignored("service.compile=true", "agent.kind=outline", "leave it out", False)
-        if self.config.beam > 1:
-            raise ConfigError(
-                f"agent.beam={self.config.beam} is for play, an evaluator would be silent "
-                "for minutes: leave it out, and give it to tangram-eval or tangram-play"
-            )
 
     def actor(self, task: Task) -> "OutlineActor":
         """See `Agent.actor`."""

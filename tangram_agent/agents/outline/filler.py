@@ -1,4 +1,4 @@
-"""Acting on outlines: the place whose rest is most surely filled, by itself or by a beam.
+"""Acting on outlines: the place whose rest is most surely filled.
 
 Where nothing fits any more, a token that is left goes to where it covers most of what is left.
 
@@ -21,7 +21,6 @@ from tangram_core.errors import ConfigError
 from tangram_sim.config import MAX_OVERLAP
 from tangram_sim.geometry.areas import Area, polygons
 from tangram_sim.geometry.dissections import Laid, Place
-from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines
 from tangram_sim.geometry.rings import covered_area
 from tangram_sim.motion.actions import velocities_of
@@ -31,35 +30,12 @@ _ANGLES = 8  # that a token is tried at where nothing fits
 _FREE = 0.5  # of what a token may cover of others
 
 
-class Fillable:
-    """How surely a layout's tokens fill what is left, by a network that learned it."""
-
-    def __init__(self, value: nn.Module, layout: Layout) -> None:
-        """Judge tokens of the same shapes, in the same order, as it learned; of any size."""
-        # (n,) logits of `Corners`, see `OutlineValue`.
-        self._value, self._filling = value, Filling(layout)
-
-    def __call__(self, rests: Sequence[Area], left: Sequence[tuple[int, ...]]) -> Floats:
-        """(n,) logits; minus infinity where there are more corners than are seen.
-
-        Args:
-            rests: n, what is left to fill.
-            left: n, how many tokens there are of each shape.
-        """
-        every = Rests.joined([self._filling.seen(*one) for one in zip(rests, left, strict=True)])
-        with torch.inference_mode():
-            logits = self._value(Corners.of(every)).numpy()
-        return np.where(every.known, logits, -np.inf).astype(np.float64)
-
-
 class Filler:
     """Chooses where the next token goes."""
 
-    def __init__(self, value: nn.Module, task: Fill, beam: int) -> None:
-        self._fillable, self._layout = Fillable(value, task.layout), task.layout
-        self._sim = task.sim
+    def __init__(self, value: nn.Module, task: Fill) -> None:
+        self._value, self._layout, self._sim = value, task.layout, task.sim
         self._filling, self._rows = Filling(task.layout), task.goal_rows
-        self._beam = beam
 
     def choose(
         self,
@@ -91,16 +67,14 @@ class Filler:
         every = [
             self._filling.places(rests[b], self._filling.left(~placed[b])) for b in range(count)
         ]
-        wanted_of = [[] if anything[b] else every[b] for b in range(count)]
-        beam = 1 if len(generators) else self._beam
-        plans = self._plans(wanted_of, beam)
+        best = self._best([[] if anything[b] else every[b] for b in range(count)])
+        for b in np.flatnonzero(anything).tolist():
+            if every[b]:
+                best[b] = every[b][int(generators[b].integers(len(every[b])))]
         token, flip = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         wanted, here = np.zeros((count, 3)), self._layout.poses(corners)
         sides = self._layout.flipped(corners)
-        for b, plan in enumerate(plans):
-            place = plan[0] if plan else None
-            if anything[b] and every[b]:
-                place = every[b][int(generators[b].integers(len(every[b])))]
+        for b, place in enumerate(best):
             laid = place.laid if place else None
             if laid is None and not len(generators):  # nothing is learned from where it then lies
                 laid = self._rough(rests[b], corners[b], placed[b])
@@ -111,42 +85,28 @@ class Filler:
         return Choice(token, flip, velocity)
 
     def values(self, places: Sequence[Place]) -> Floats:
-        """How surely what is left can be filled, as logits; a filled one is surest."""
+        """How surely what is left can be filled, as logits; a filled one is surest.
+
+        Minus infinity where there are more corners than are seen.
+        """
         found = np.full(len(places), np.inf)
         still = [i for i, place in enumerate(places) if not place.filled]
         if still:
-            rests = [places[i].rest for i in still]
-            found[still] = self._fillable(rests, [places[i].left for i in still])
+            seen = [self._filling.seen(places[i].rest, places[i].left) for i in still]
+            every = Rests.joined(seen)
+            with torch.inference_mode():
+                logits = self._value(Corners.of(every)).numpy()
+            found[still] = np.where(every.known, logits, -np.inf)
         return found
 
-    def _plans(self, every: Sequence[list[Place]], beam: int) -> list[tuple[Place, ...]]:
-        """Of each environment the places that lead furthest; none where there are none.
-
-        Args:
-            every: what may be laid now.
-            beam: states of each depth that are followed; one plays what is best now, and looks no
-                further.
-        """
-        found: list[tuple[Place, ...]] = [()] * len(every)
-        states: list[tuple[int, tuple[Place, ...]]]
-        states = [(b, (one,)) for b, places in enumerate(every) for one in places]
-        while states:
-            values = self.values([places[-1] for _, places in states])
-            kept = []
-            for b in {row for row, _ in states}:
-                own = [i for i, (row, _) in enumerate(states) if row == b]
-                own = [own[i] for i in np.argsort(-values[own], kind="stable")[:beam]]
-                found[b] = states[own[0]][1]
-                if not found[b][-1].filled:
-                    kept += [states[i] for i in own]
-            if beam == 1:
-                break
-            states = [
-                (b, (*places, place))
-                for b, places in kept
-                for place in self._filling.places(places[-1].rest, places[-1].left)
-            ]
-        return found
+    def _best(self, every: Sequence[list[Place]]) -> list[Place | None]:
+        """Of each environment the place whose rest is most surely filled; the first of equals."""
+        values = self.values([one for places in every for one in places])
+        own = np.split(values, np.cumsum([len(places) for places in every])[:-1])
+        return [
+            places[int(worth.argmax())] if places else None
+            for places, worth in zip(every, own, strict=True)
+        ]
 
     def _taken(
         self, laid: Laid | None, here: Floats, sides: Bools, placed: Bools

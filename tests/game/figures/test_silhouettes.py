@@ -13,7 +13,8 @@ from PIL import Image, ImageDraw
 from tangram_agent.runs import load_run
 from tangram_core.errors import ConfigError
 from tangram_game.cli import with_absolute_paths
-from tangram_game.config import PlayConfig
+from tangram_game.config import EvalConfig, PlayConfig
+from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.silhouettes import read_silhouette
 from tangram_game.play import play_run
 from tangram_sim.geometry.rings import covered_area
@@ -211,3 +212,23 @@ def test_settings_that_a_silhouette_has_no_use_for_are_refused(
     picture(tmp_path / "cat.png")
     with pytest.raises(ConfigError, match=message):
         PlayConfig(**({"silhouette": "cat"} | settings))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("puzzle", [("heart",), None])
+def test_a_report_takes_the_scores_of_an_agent_of_outlines(
+    tmp_path: Path, puzzle: tuple[str, ...] | None
+) -> None:
+    """The mean reward of several tokens is of what they cover; every episode is told."""
+    out = tmp_path / "scores.json"
+    sim = {"backend": "kinematic"}
+    few = {} if puzzle else {"episodes": 2}
+    config = EvalConfig(
+        "pretrained/tangram7_silhouette", puzzle=puzzle, out=str(out), changes={"sim": sim}, **few
+    )
+    assert evaluate_run(config) == 0
+    report = json.loads(out.read_text())
+    for scores in (report, *report["baselines"].values()):
+        assert len(scores["coverage_each"]) == scores["episodes"] == (2 if puzzle is None else 1)
+        assert scores["mean_reward"] == pytest.approx(
+            2.0 * np.mean(scores["coverage_each"]) - 1.0, abs=1e-5
+        )

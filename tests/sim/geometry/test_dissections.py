@@ -15,7 +15,6 @@ from tangram_sim.geometry.dissections import Budget, Laid, Search, Tokens
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.connected import sample_connected
 from tangram_vision.silhouettes.silhouettes import (
-    UNLEARNED,
     covered,
     fill_outline,
     nearest_fill,
@@ -195,10 +194,10 @@ def test_tokens_that_lie_on_each_other_are_no_better_attempt() -> None:
     one = [Laid(large, False, np.zeros(3))]
     two = [*one, Laid(large, False, np.array([0.05, 0.0, 0.0]))]
     for tried in ([one, two], [two, one]):
-        found, iou = nearest_fill(side, LAYOUT, Budget(0.0), tried, UNLEARNED)
+        found, iou = nearest_fill(side, LAYOUT, Budget(0.0), tried)
         assert found is not None
         assert len(found.laid) == 1
         assert iou == pytest.approx(0.25, abs=0.01)
-    both, more = nearest_fill(side, LAYOUT, Budget(0.0), [two], UNLEARNED)
+    both, more = nearest_fill(side, LAYOUT, Budget(0.0), [two])
     assert both is not None
     assert more > 0.26
