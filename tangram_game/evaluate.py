@@ -40,7 +40,6 @@ MAX_LINES = 40  # of puzzles and of faults on the screen
 
 # What is shown beside the scores that a task declares; the rest is only in the file.
 _BESIDE = (
-    Score("share_solved_iou", "solved (IoU 0.95)"),
     Score("seconds_per_puzzle", "seconds"),
     Score("ms_per_choice", "CPU ms for each action", 1),
 )
@@ -213,7 +212,7 @@ def puzzles_table(puzzles: Sequence[Mapping[str, Any]], full: str | None) -> Tab
     rest = f"and {left:,} more: all are in {full or 'the file that out= names'}"
     table = Table(caption=rest if left > 0 else None)
     counts = [name for name in ("wrong", "blocked") if all(name in one for one in puzzles)]
-    for name in ("puzzle", "covered", "IoU", *counts, ""):
+    for name in ("puzzle", "coverage", "IoU", *counts, ""):
         table.add_column(name, justify="left" if name in ("puzzle", "") else "right")
     for one in puzzles[:MAX_LINES]:
         name = f"{one['name']} {one['degrees']:g}°" if one["degrees"] else str(one["name"])

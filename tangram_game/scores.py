@@ -76,7 +76,7 @@ def _of_areas(found: Assembled) -> Scores:
     means = {name: float(np.mean(getattr(found, name))) for name in (*_SHARES, *_ACTIONS)}
     reward = float(np.mean(scaled_overlap(found.coverage)))
     solved = float(np.mean(found.iou >= SOLVED))
-    return means | {"mean_reward": reward, "share_solved_iou": solved}
+    return means | {"mean_reward": reward, "solved": solved}
 
 
 def of_each(played: Played) -> Scores:

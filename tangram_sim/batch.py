@@ -15,7 +15,7 @@ from tangram_core.errors import ConfigError
 from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
 from tangram_sim.episodes import spec_of
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import outlines, overlap_share, shared_area
+from tangram_sim.geometry.overlap import covered_share, outlines, shared_area
 from tangram_sim.motion.actions import (
     action_size,
     chosen_tokens,
@@ -240,7 +240,7 @@ class BatchedEnv:
             self.sight.follow(self.pictures, named, np.where(refused[:, None], 0.0, velocity))
         self._look()
         self.steps_done += 1
-        share = overlap_share(self.corners, self.goals, self.layout)
+        share = covered_share(self.corners, self.goals, self.layout)
         return StepResult(
             rewards=self._rewards(share, camera),
             overlap=share,

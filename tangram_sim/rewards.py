@@ -16,7 +16,7 @@ from tangram_core.errors import ConfigError, OwnCodeError
 from tangram_core.run.code import load_code, read_code
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.geometry.overlap import covered_share
 from tangram_sim.sight.pictures import token_pixels
 
 MAX_REWARD = 1e6  # of a user's own function
@@ -79,7 +79,7 @@ def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
 
 def overlap(achieved: Floats, desired: Floats, layout: Layout) -> Floats:
     """Eq. 14 on exact polygons, from [0, 1] to [-1, 1]: r = 2 * covered share of the target - 1."""
-    return scaled_overlap(overlap_share(achieved, desired, layout))
+    return scaled_overlap(covered_share(achieved, desired, layout))
 
 
 def _shown(achieved: Floats, desired: Floats, layout: Layout, width: float) -> Floats:

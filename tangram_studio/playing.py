@@ -22,7 +22,7 @@ from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.task import History
 from tangram_sim.batch import BatchedEnv, Starts
 from tangram_sim.config import RewardConfig
-from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.geometry.overlap import covered_share
 from tangram_sim.motion.actions import chosen_tokens
 from tangram_sim.world.pushing import PushTable
 from tangram_tasks.metrics import iou
@@ -202,7 +202,7 @@ def _scores(scene: Sides, goal: Sides) -> tuple[float, float]:
     """Coverage and IoU."""
     layout = player().layout
     here, there = (layout.corners(one.poses, one.flipped)[None] for one in (scene, goal))
-    coverage = overlap_share(here, there, layout)
+    coverage = covered_share(here, there, layout)
     return float(coverage[0]), float(iou(layout, here, coverage)[0])
 
 

@@ -90,7 +90,7 @@ class PlaceEnv(Env):
         if result is None:
             return {}
         share, token = float(result.overlap[0]), int(result.tokens[0])
-        info: Json = {"overlap": share, "is_success": share >= SOLVED}
+        info: Json = {"coverage": share, "is_success": share >= SOLVED}
         if result.camera_rewards is not None:
             info["reward_camera"] = float(result.camera_rewards[0])
         if result.refused[0]:

@@ -17,9 +17,10 @@ from tangram_sim.rewards import scaled_overlap
 from tangram_tasks.place import SEVERAL, Place
 
 _AREAS = (
-    *("mean_reward", "coverage", "iou", "raw_overlap", "raw_overlap_p10"),
+    *("coverage", "solved", "iou", "mean_reward", "coverage_p10"),
     *("blocked", "refused", "actions_used"),
 )
+_SOLVED = Score("solved", "solved (IoU 0.95)")
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Fill(Place):
     @property
     def scores(self) -> tuple[Score, ...]:  # type: ignore[override]
         """Nothing of where a piece should lie: any dissection counts."""
-        return tuple(score for score in SEVERAL if score.name in _AREAS)
+        own = {score.name: score for score in SEVERAL} | {_SOLVED.name: _SOLVED}
+        return tuple(own[name] for name in _AREAS)
 
     def rewards(self, achieved: Array, desired: Array) -> Floats:
         """(n,) Eq. 14 of corners (n, V, 2) and of outlines as rows (n, G, 2)."""
@@ -48,8 +50,13 @@ class Fill(Place):
         return scaled_overlap(np.clip(shared / self.layout.areas.sum(), 0.0, 1.0))
 
     def score(self, played: Played) -> dict[str, float]:
-        """Those of areas."""
-        return {name: one for name, one in super().score(played).items() if name in _AREAS}
+        """Those of areas; a figure is solved by what it shares with its outline."""
+        from tangram_tasks.metrics import SOLVED, assembled  # noqa: PLC0415  # scipy
+        from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
+
+        found = assembled(self.layout, PlayedTokens.of(played))
+        every = super().score(played) | {"solved": float(np.mean(found.iou >= SOLVED))}
+        return {name: every[name] for name in _AREAS}
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
         """Chance; where no piece is told, no formula knows where to go."""

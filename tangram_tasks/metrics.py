@@ -10,7 +10,7 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Ints
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import outlines, overlap_share, shared_areas, union_area
+from tangram_sim.geometry.overlap import covered_share, outlines, shared_areas, union_area
 from tangram_sim.rewards import make_reward
 from tangram_tasks.pairing import alike, paired
 from tangram_tasks.played import Played
@@ -48,7 +48,7 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
 
     Returns:
         mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on),
-        mean_reward_dense (Eq. 15), raw_overlap and its 10th percentile,
+        mean_reward_dense (Eq. 15), coverage (in [0, 1]) and its 10th percentile,
         medians and 90th percentiles of the errors over all tokens, episodes; mean_reward_camera
         and mean_train_reward where they exist; with several tokens the means of `Assembled`.
     """
@@ -57,8 +57,8 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
     scores = {
         "mean_reward": float(np.mean(2.0 * played.overlap - 1.0)),
         "mean_reward_dense": float(np.mean(dense(played.ends, played.goals))),
-        "raw_overlap": float(np.mean(played.overlap)),
-        "raw_overlap_p10": float(np.percentile(played.overlap, 10)),
+        "coverage": float(np.mean(played.overlap)),
+        "coverage_p10": float(np.percentile(played.overlap, 10)),
         "angle_error_deg_median": float(np.median(angle)),
         "angle_error_deg_p90": float(np.percentile(angle, 90)),
         "position_error_median": float(np.median(position)),
@@ -105,14 +105,14 @@ class Assembled:
         return solved
 
     def means(self) -> dict[str, float]:
-        """Each score's mean over the episodes; `solved` as `share_solved`."""
+        """Each score's mean over the episodes."""
         means = {name: float(np.mean(column)) for name, column in vars(self).items()}
-        return means | {"share_solved": float(np.mean(self.solved))}
+        return means | {"solved": float(np.mean(self.solved))}
 
 
 def assembled(layout: Layout, played: Played) -> Assembled:
     """Scores of episodes as they ended."""
-    coverage = overlap_share(played.ends, played.goals, layout)
+    coverage = covered_share(played.ends, played.goals, layout)
     covered = covered_shares(layout, played.ends, played.goals)
     refused = played.refused.sum(axis=1)
     return Assembled(

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tangram_tasks.env import PlaceEnv
 
 PICTURES, PIXELS = 12, 216  # test episodes on a sheet, and the side of each
-_REWARD = Score("mean_reward", "mean reward")
+_REWARD, _COVERAGE = Score("mean_reward", "mean reward"), Score("coverage", "coverage")
 _ERRORS = (
     Score("angle_error_deg_median", "angle error", 2, "°"),
     Score("position_error_median", "position error", 4),
@@ -37,16 +37,15 @@ _MORE = (
     Score("mean_reward_camera", "mean reward, camera"),
     Score("mean_reward_dense", "mean reward of Eq. 15"),
     Score("mean_train_reward", "mean reward as trained on"),
-    Score("raw_overlap_p10", "raw overlap, 10th perc."),
+    Score("coverage_p10", "coverage, 10th perc."),
 )
-ONE_TOKEN = (_REWARD, Score("raw_overlap", "raw overlap"), *_ERRORS, *_MORE)
+ONE_TOKEN = (_REWARD, _COVERAGE, *_ERRORS, *_MORE)
 SEVERAL = (
-    _REWARD,
-    Score("coverage", "covered"),
-    Score("share_solved", "solved (95 % covered)"),
+    _COVERAGE,
+    Score("solved", "solved (95 % covered)"),
     Score("iou", "IoU"),
     *_ERRORS,
-    Score("raw_overlap", "raw overlap"),
+    _REWARD,
     *_MORE,
     Score("wrong", "pieces under another shape", 2),
     Score("doubly_used", "pieces under two tokens", 2),

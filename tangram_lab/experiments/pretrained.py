@@ -112,7 +112,7 @@ def median(seeds: Sequence[Candidate]) -> Candidate:
 
 def _ranks(result: Mapping[str, Any]) -> str:
     """The score by which runs are ranked."""
-    return "mean_reward" if result.get("solved") is None else "solved"
+    return "solved" if result.get("mean_reward") is None else "mean_reward"
 
 
 def _read(run_dir: Path) -> Candidate:
@@ -122,7 +122,7 @@ def _read(run_dir: Path) -> Candidate:
     except (OSError, ValueError, RecursionError):
         raise RunError(f"cannot read {path}: name the folder of a finished run") from None
     if not isinstance(result, dict) or result.get(_ranks(result)) is None:
-        raise RunError(f"{path} holds no {_ranks(result)}: train it with an evaluator")
+        raise RunError(f"{path} holds no score: train it with an evaluator")
     run = load_run(run_dir)
     if not result["scored_updates"] == result["updates"] == run.updates:
         raise RunError(
@@ -170,8 +170,7 @@ _BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "work
 
 # Its scores of each seed.
 _SCORES = (
-    *("solved", "placed", "pushes", "mean_reward", "raw_overlap", "raw_overlap_p10"),
-    *("share_solved", "share_solved_iou", "iou"),
+    *("solved", "placed", "pushes", "mean_reward", "coverage", "coverage_p10", "iou"),
     *("angle_error_deg_median", "position_error_median"),
 )
 

@@ -22,8 +22,6 @@ NAMED = 6  # settings in the name of a row
 LABELS = {
     "mean_reward": "mean reward",
     "mean_reward_dense": "mean reward, dense",
-    "share_solved": "solved",
-    "share_solved_iou": "solved, IoU 0.95",
     "iou": "IoU",
     "angle_error_deg": "angle error, °",
     "position_error": "position error",

@@ -7,6 +7,7 @@ every seed.
 import csv
 import io
 import os
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,22 +17,26 @@ import pandas as pd
 from tangram_core.errors import RunError
 
 AGENT = "agent"
+# What scores were called before version 0.2, in files of that time; they are read for one version.
+OLD = {
+    "raw_overlap": "coverage",
+    "raw_overlap_p10": "coverage_p10",
+    "share_solved": "solved",
+    "share_solved_iou": "solved",
+}
 KEY = ("training", "seed", "test", "policy")
 # Column -> name in the files of tangram-eval.
 SCORES = {
     "mean_reward": "mean_reward",
     "mean_reward_dense": "mean_reward_dense",
     "coverage": "coverage",
-    "share_solved": "share_solved",
-    "share_solved_iou": "share_solved_iou",
+    "solved": "solved",
     "iou": "iou",
-    "filled": "filled",
     "angle_error_deg": "angle_error_deg_median",
     "position_error": "position_error_median",
     "wrong": "wrong",
     "doubly_used": "doubly_used",
     "blocked": "blocked",
-    "solved": "solved",
     "pushes": "pushes",
     "ms_per_choice": "ms_per_choice",
 }
@@ -56,6 +61,16 @@ class Spread(NamedTuple):
     most: float
 
 
+def tell_of_old(names: Iterable[str], path: Path) -> list[str]:
+    """Those names of a file that are old, with a warning if there are any."""
+    old = [name for name in names if name in OLD]
+    if old:
+        told = ", ".join(f"{name} is called {OLD[name]} now" for name in old)
+        message = f"{path}: {told}; version 0.3 reads no old name"
+        warnings.warn(message, FutureWarning, stacklevel=2)
+    return old
+
+
 def read_rows(path: Path) -> pd.DataFrame:
     """All rows of a CSV.
 
@@ -66,6 +81,10 @@ def read_rows(path: Path) -> pd.DataFrame:
         found = pd.read_csv(path, dtype={"training": str, "test": str, "commit": str})
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: cannot be read ({error}): restore it, or delete it") from None
+    for name in tell_of_old(found.columns, path):
+        column = found.pop(name)
+        new = OLD[name]
+        found[new] = found[new].combine_first(column) if new in found else column
     return found
 
 
@@ -146,7 +165,10 @@ def append(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         writer.writeheader()
-    writer.writerows({name: _written(value) for name, value in row.items()} for row in rows)
+    old = {OLD[name]: name for name in head if name in OLD}  # a file keeps its columns
+    writer.writerows(
+        {old.get(name, name): _written(value) for name, value in row.items()} for row in rows
+    )
     with path.open("a", encoding="utf-8") as file:
         file.write(text.getvalue())
         file.flush()

@@ -17,7 +17,16 @@ from tangram_core.errors import ConfigError
 from tangram_core.run.code import override
 from tangram_core.run.process import handling
 from tangram_core.store.files import write_whole
-from tangram_lab.experiments.rows import COLUMNS, CURVE, append, curve_rows, done, rows_of
+from tangram_lab.experiments.rows import (
+    COLUMNS,
+    CURVE,
+    OLD,
+    append,
+    curve_rows,
+    done,
+    rows_of,
+    tell_of_old,
+)
 from tangram_lab.experiments.studies import Job, StudyConfig
 
 TOLD = "told.json"
@@ -107,7 +116,11 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return content if isinstance(content, dict) else {}
+    if not isinstance(content, dict):
+        return {}
+    for name in tell_of_old(content, path):
+        content.setdefault(OLD[name], content.pop(name))
+    return content
 
 
 def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int:

@@ -23,7 +23,7 @@ from tangram_sim.drawing.strokes import (
     to_points,
 )
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.geometry.overlap import covered_share
 
 _EDGE = (168, 158, 138)
 _OPACITY = 0.9
@@ -106,7 +106,7 @@ def figure_sheet(
 
 def captions(layout: Layout, ends: Floats, goals: Floats, titles: Sequence[str]) -> list[str]:
     """Each figure's name and the share of it that is covered, in per cent."""
-    covered = overlap_share(ends, goals, layout)
+    covered = covered_share(ends, goals, layout)
     return [f"{title}   {100 * share:.1f} %" for title, share in zip(titles, covered, strict=True)]
 
 

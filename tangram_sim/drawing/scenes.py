@@ -30,7 +30,7 @@ from tangram_sim.drawing.strokes import (
     to_outlines,
 )
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.geometry.overlap import covered_share
 
 _OPACITY = 0.8  # of a token, so that the target shows through
 _PALETTE_FRAMES = 40  # that a film's colours are taken from
@@ -96,7 +96,7 @@ def episode_sheet(
         draw_scene(layout, arena, end, goal, size, start=start)
         for start, end, goal in zip(starts, ends, goals, strict=True)
     ]
-    covered = overlap_share(ends, goals, layout) if shares is None else shares
+    covered = covered_share(ends, goals, layout) if shares is None else shares
     captions = [f"overlap  {share:.3f}" for share in covered]
     sheet = contact_sheet(scenes, columns, captions)
     return with_legend(sheet, max(size // 18, SMALLEST_TEXT))

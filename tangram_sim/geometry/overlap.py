@@ -164,7 +164,7 @@ def _box(polygons: Floats) -> tuple[Floats, Floats]:
     return corners.min(axis=0), corners.max(axis=0)
 
 
-def overlap_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
+def covered_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
     """Raw overlap in [0, 1], (B,): the covered share of the target's area."""
     whole = layout.areas.sum()
     share: Floats = np.clip(overlap_area(tokens, targets, layout) / whole, 0.0, 1.0)

@@ -39,7 +39,7 @@ def broadcast(sent: Weights, epoch: str = "e") -> bytes:
 
 def scores(count: int = 2) -> Scores:
     picture = np.arange(count * PICTURE_WIDTH * 3).astype(np.uint8).reshape(count, -1, 3)
-    return Scores(7, {"mean_reward": 0.25, "raw_overlap": 0.5}, picture)
+    return Scores(7, {"mean_reward": 0.25, "coverage": 0.5}, picture)
 
 
 def hello(

@@ -45,7 +45,7 @@ def test_it_runs_without_a_warning(
     if "over" in names:
         assert names["info"]["is_success"]
     if "overlap" in names:
-        assert names["overlap"] > 0.99
+        assert names["coverage"] > 0.99
     if "model" in names:
         assert names["model"]._n_updates > 100
     assert {*folder.iterdir()} == before

@@ -32,7 +32,7 @@ def test_a_short_training_learns_position_and_angle_and_leaves_a_whole_run(train
     assert result["angle_error_deg_median"] < 2.0
     assert result["position_error_median"] < 0.03
     assert result["mean_reward_camera"] == pytest.approx(result["mean_reward"], abs=0.05)
-    assert result["raw_overlap"] == pytest.approx((result["mean_reward"] + 1) / 2, abs=1e-6)
+    assert result["coverage"] == pytest.approx((result["mean_reward"] + 1) / 2, abs=1e-6)
     assert result["episodes"] >= 10 * UPDATES
     assert result["wall_s"] >= result["train_s"] > 0
     facts = {"updates": UPDATES, "seed": 0, "agent": "tangram", "backend": "physics"}
@@ -79,7 +79,7 @@ def test_eval_repeats_the_scores_of_the_run_and_applies_several_actions(
     more = () if actions is None else (f"sim.actions_per_token={actions}", "episodes=30")
     printed = run_here("tangram-eval", f"run_dir={trained}", f"out={out}", *more, cwd=tmp_path)
     result, scores = (json.loads(p.read_text()) for p in (trained / "result.json", out))
-    assert f"{scores['raw_overlap']:.3f}" in printed
+    assert f"{scores['coverage']:.3f}" in printed
     if actions is None:
         assert scores["mean_reward"] == pytest.approx(result["mean_reward"], abs=1e-4)
     else:

@@ -22,7 +22,7 @@ It has 0.500 (0.250 to 0.750), solves 12.5 % and is 0.1235 fast; `0.999` is code
 
 Only [speeds](results/bench.json): 0.123.
 """
-ROWS = """training,seed,test,policy,mean_reward,share_solved
+ROWS = """training,seed,test,policy,mean_reward,solved
 one,0,a,agent,0.25,0.125
 one,1,a,agent,0.5,0.125
 one,2,a,agent,0.75,0.125

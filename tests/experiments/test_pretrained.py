@@ -31,8 +31,8 @@ pytestmark = pytest.mark.fast
 TESTS = 3
 RESULT = {
     "mean_reward_camera": 0.9,
-    "raw_overlap": 0.95,
-    "raw_overlap_p10": 0.9,
+    "coverage": 0.95,
+    "coverage_p10": 0.9,
     "angle_error_deg_median": 0.5,
     "angle_error_deg_p90": 1.0,
     "position_error_median": 0.001,
@@ -122,7 +122,7 @@ def test_an_agent_of_outlines_ships_beside_its_rivals(
     card = json.loads((folder / "card.json").read_text())
     assert set(card["tests"]["scores"]) == {"this run", "largest first", "random"}
     told = {*card["tests"]["scores"]["this run"], *card["puzzles"]["test"]["scores"]}
-    assert {"iou", "share_solved_iou", "raw_overlap_p10"} <= told
+    assert {"iou", "solved", "coverage_p10"} <= told
 
 
 def test_an_agent_of_pushes_ships_trying_some_and_beside_who_is_quick(tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def other_net(run: Path) -> None:
     [
         (lambda run: (run / "result.json").unlink(), "cannot read .*result.json"),
         (lambda run: (run / "result.json").write_text("{"), "cannot read .*result.json"),
-        (lambda run: finished(run.parent, 1, None), "holds no mean_reward"),
+        (lambda run: finished(run.parent, 1, None), "holds no score"),
         (lambda run: finished(run.parent, 1, 0.3, scored_updates=5), "scored after 5 of its 7"),
         (lambda run: finished(run.parent, 1, 0.3, updates=9, scored_updates=9), "weights of 7"),
         (

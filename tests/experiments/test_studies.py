@@ -21,7 +21,7 @@ from tangram_lab.experiments.rows import (
     rows_of,
     spreads,
 )
-from tangram_lab.experiments.runner import Work, run_study
+from tangram_lab.experiments.runner import Work, read_json, run_study
 from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 from tests.test_docs import ROOT, unknown
 
@@ -244,6 +244,23 @@ def test_what_is_no_csv_is_told(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\x00")
     with pytest.raises(RunError, match=r"game\.csv: cannot be read"):
         read_rows(path)
+
+
+def test_scores_of_version_0_1_are_read_by_their_new_names(tmp_path: Path) -> None:
+    path, result = tmp_path / "game.csv", tmp_path / "result.json"
+    path.write_text("training,seed,test,policy,share_solved,share_solved_iou\none,0,a,agent,0.5,\n")
+    append(
+        path,
+        COLUMNS,
+        [{"training": "one", "seed": 1, "test": "a", "policy": "agent", "solved": 1.0}],
+    )
+    with pytest.warns(FutureWarning, match=r"game\.csv: share_solved is called solved now, .*0\.3"):
+        rows = read_rows(path)
+    assert rows["solved"].tolist() == [0.5, 1.0]
+    assert not {"share_solved", "share_solved_iou"} & {*rows.columns}
+    result.write_text('{"raw_overlap": 0.75, "mean_reward": 0.5}')
+    with pytest.warns(FutureWarning, match="raw_overlap is called coverage now"):
+        assert read_json(result) == {"coverage": 0.75, "mean_reward": 0.5}
 
 
 def test_a_report_is_a_page_and_a_picture_for_each_figure(

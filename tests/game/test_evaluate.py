@@ -27,12 +27,12 @@ from worker.score.test_set import FixedTests
 pytestmark = pytest.mark.fast
 
 SCORES = {
-    *("mean_reward", "mean_reward_camera", "raw_overlap", "raw_overlap_p10", "episodes"),
+    *("mean_reward", "mean_reward_camera", "coverage", "coverage_p10", "episodes"),
     *("angle_error_deg_median", "angle_error_deg_p90"),
     *("position_error_median", "position_error_p90"),
 }
 MEANS = {
-    *("coverage", "iou", "share_solved", "wrong", "doubly_used", "refused", "blocked"),
+    *("coverage", "iou", "solved", "wrong", "doubly_used", "refused", "blocked"),
     *("actions_used", "seconds_per_puzzle", "coverage_each"),
     *("position_error_median", "angle_error_deg_median"),
 }
@@ -155,7 +155,7 @@ def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
         assert report[name] == pytest.approx(sum(values) / 4)
     assert all(len(one["position_errors"]) == 7 for one in report["puzzles"])
     exact, chance = report["baselines"]["exact"], report["baselines"]["random"]
-    assert (exact["share_solved"], exact["coverage"]) == (1.0, pytest.approx(1.0))
+    assert (exact["solved"], exact["coverage"]) == (1.0, pytest.approx(1.0))
     assert chance["coverage"] < 0.5
     printed = capsys.readouterr().out
     assert "4 puzzles of mine.json, 1 action a token" in printed
@@ -176,7 +176,6 @@ def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path,
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:
     report = evaluated(tmp_path, episodes=3)
     assert set(report) >= MEANS | {"mean_reward", "mean_reward_camera", "episodes"}
-    assert report["coverage"] == pytest.approx(report["raw_overlap"])
     assert set(report["baselines"]) == {"exact", "random"}
     assert "puzzles" not in report
     for scores in (report, *report["baselines"].values()):

@@ -58,7 +58,7 @@ def arrival(made: Setup, sequence: int, count: int = 4, version: int = 0) -> Epi
 def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
     """An evaluation with a picture."""
     picture = np.full((120, PICTURE_WIDTH, 3), 200, np.uint8)
-    scalars = {"mean_reward": reward, "raw_overlap": 0.75, "episodes": 100.0}
+    scalars = {"mean_reward": reward, "coverage": 0.75, "episodes": 100.0}
     return ScoresArrived(0, 1, Scores(version, scalars, picture))
 
 

@@ -282,4 +282,4 @@ def test_a_task_tells_why_nothing_moved() -> None:
             "token 0 would lie on others by 27.000% of its area, at most 20.000% allowed: set it d"
         )
         env.step(np.array([[1.0, 0.1, 0.0, 0.0]], np.float32))
-        assert env.told().keys() == {"overlap", "is_success"}
+        assert env.told().keys() == {"coverage", "is_success"}

@@ -135,7 +135,7 @@ def test_horizon_refusal_and_info() -> None:
     action = np.array([-1.0, 0.1, 0, 0], dtype=np.float32)
     _, _, terminated, truncated, info = env.step(action)
     assert (terminated, truncated) == (False, False)
-    assert set(info) == {"overlap", "is_success"}
+    assert set(info) == {"coverage", "is_success"}
     _, _, terminated, truncated, info = env.step(action)
     assert (terminated, truncated) == (False, True)  # token 1 is left: only the steps ran out
     assert info["refused"] == "token 0 is placed already: it had its 1 actions"
@@ -176,8 +176,8 @@ def nearly(env: TaskEnv, miss: float = 0.03) -> dict[str, Any]:
 @pytest.mark.parametrize(("miss", "expected"), [(0.02, True), (0.03, False)])
 def test_success_is_95_percent_of_the_target_covered(miss: float, expected: bool) -> None:
     info = nearly(kinematic(), miss)
-    assert 0.9 < info["overlap"] < 0.98
-    assert info["is_success"] is expected is (info["overlap"] >= 0.95)
+    assert 0.9 < info["coverage"] < 0.98
+    assert info["is_success"] is expected is (info["coverage"] >= 0.95)
 
 
 @pytest.mark.parametrize("source", ["polygon", "camera"])

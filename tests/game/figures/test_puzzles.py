@@ -8,7 +8,7 @@ import pytest
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_game.figures.puzzles import find_figures, play_figures
-from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.geometry.overlap import covered_share
 from tangram_sim.puzzles.figures import library, load_puzzle
 from tangram_tasks.place import Place
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
@@ -55,7 +55,7 @@ def test_pieces_are_as_large_as_the_tokens(tmp_path: Path, scale: float) -> None
     (figure,) = find_figures(str(path), made)
     corners = made.layout.corners(figure.poses, figure.flipped)[None]
     own = load_puzzle("cat", scale).corners[None]
-    assert overlap_share(corners, own, made.layout)[0] > 0.99
+    assert covered_share(corners, own, made.layout)[0] > 0.99
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -
     made = setup(tokens, backend=backend, actions_per_token=actions).task
     with closing(FixedTests(made, 5, 5)) as tests:
         scores = made.score(tests.play(exact_policy(made.layout, made.sim)))
-    assert scores["raw_overlap_p10"] > 0.9999
+    assert scores["coverage_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
 
@@ -64,8 +64,8 @@ def test_the_exact_policy_solves_the_game(backend: str, targets: str, allow_flip
     made = setup(GAME, backend=backend, pixels=16, **sim).task
     with closing(FixedTests(made, 8, 8)) as tests:
         scores = made.score(tests.play(exact_policy(made.layout, made.sim)))
-    assert scores["raw_overlap_p10"] > 0.999
-    assert (scores["share_solved"], scores["wrong"], scores["refused"]) == (1.0, 0.0, 0.0)
+    assert scores["coverage_p10"] > 0.999
+    assert (scores["solved"], scores["wrong"], scores["refused"]) == (1.0, 0.0, 0.0)
     assert scores["angle_error_deg_p90"] < 0.1
 
 

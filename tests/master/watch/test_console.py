@@ -42,7 +42,7 @@ STATUS = RunStatus(
         "players": 2,
         "evaluators": 1,
         "test/mean_reward": 0.9312,
-        "test/raw_overlap": 0.9656,
+        "test/coverage": 0.9656,
         "test/angle_error_deg_median": 1.214,
         "test/position_error_median": 0.01034,
     },
@@ -69,7 +69,7 @@ def test_durations(seconds: float, shown: str) -> None:
         (
             STATUS,
             "1:23 | 27%, 1:01:40 left | 12,345 episodes | 1,234 updates | 950 transitions/s | "
-            "95.1 updates/s | mean reward 0.931, raw overlap 0.966, "
+            "95.1 updates/s | mean reward 0.931, coverage 0.966, "
             "angle error 1.21° | 2 workers | learning",
             ["27%  1:23, 1:01:40 left", "0.931", "1.21°", "2 workers, 1 evaluator · learning"],
         ),

@@ -119,7 +119,7 @@ def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores
     hub.counters.update({f"event{i}": 2**70 for i in range(100)})
     made = loop(tmp_path, MADE, hub)
     found = {score.name: 0.5 for score in MADE.task.scores} | {
-        "raw_overlap": float("nan"),
+        "coverage": float("nan"),
         "mean_reward": 1e300,
     }
     made.clock.record.score(found, version=0)
@@ -129,5 +129,5 @@ def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores
     result = make_result(
         status, MADE.task.scores, made.guard.trainer.facts(), seed=0, reason="SIGTERM"
     )
-    assert (result["raw_overlap"], result["mean_reward"]) == (None, 1e18)
+    assert (result["coverage"], result["mean_reward"]) == (None, 1e18)
     assert result["position_error_p90"] == 0.5

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.fast
 
 SCORED = {
     "mean_reward": 0.9312,
-    "raw_overlap": 0.9656,
+    "coverage": 0.9656,
     "angle_error_deg_median": 1.214,
     "position_error_median": 0.01034,
 }

@@ -12,9 +12,9 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import (
     area,
     clip,
+    covered_share,
     outlines,
     overlap_area,
-    overlap_share,
     pairs_overlap,
     union_area,
 )
@@ -131,7 +131,7 @@ def test_the_share_is_of_the_targets_area_and_counts_a_place_once(
     layout = layout_of("square", second, scale=1.0)
     poses = np.zeros((2, 1, 2, 3))
     poses[0, 0, :, 0], poses[1, 0, :, 0] = places, (0.0, 2.0)
-    assert overlap_share(*layout.corners(poses), layout)[0] == pytest.approx(share)
+    assert covered_share(*layout.corners(poses), layout)[0] == pytest.approx(share)
 
 
 def _placed(name: str, pose: tuple[float, ...]) -> Floats:

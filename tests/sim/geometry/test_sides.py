@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tangram_core.arrays import Bools, Floats
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.geometry.overlap import covered_share
 from tangram_sim.geometry.shapes import SHAPE_NAMES, Shape, mirror_image, polygon, tan, turn_onto
 from tangram_sim.motion.actions import action_size, flips
 from tangram_sim.sight.pictures import TOKEN_GRAY, rasterise
@@ -100,11 +100,11 @@ def test_a_mirrored_layout_is_the_mirror_image() -> None:
 def test_overlap_is_the_same_in_the_mirror(seed: int) -> None:
     """All of it: that of tokens on either side, and of both sides in one place."""
     states, targets = drawn(2, seed), drawn(2, seed + 1)
-    share = overlap_share(LAYOUT.corners(*states), LAYOUT.corners(*targets), LAYOUT)
+    share = covered_share(LAYOUT.corners(*states), LAYOUT.corners(*targets), LAYOUT)
     mirrored = [LAYOUT.corners(*LAYOUT.mirrored(*layout)) for layout in (states, targets)]
-    np.testing.assert_allclose(overlap_share(mirrored[0], mirrored[1], LAYOUT), share, atol=1e-9)
+    np.testing.assert_allclose(covered_share(mirrored[0], mirrored[1], LAYOUT), share, atol=1e-9)
     own = LAYOUT.corners(*states)
-    assert (overlap_share(own, own, LAYOUT) > 0.5).all()
+    assert (covered_share(own, own, LAYOUT) > 0.5).all()
 
 
 def test_sides_are_told_of_noisy_corners() -> None:

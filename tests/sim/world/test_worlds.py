@@ -12,7 +12,7 @@ from tangram_core.errors import ConfigError, SamplingError
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.geometry.overlap import area, clip, overlap_share
+from tangram_sim.geometry.overlap import area, clip, covered_share
 from tangram_sim.rewards import TargetPictures
 from tangram_sim.sight.pictures import BACKGROUND, TOKEN_GRAY, rasterise
 from tangram_sim.targets.sampling import sample_batch
@@ -180,7 +180,7 @@ def camera_bound(layout: Layout, tokens: Floats, targets: Floats, pixel: float) 
         for k in range(layout.tokens):
             piece = clip(target, tokens[:, layout.corners_of(k)])
             common += (perimeter(piece) * pixel / 2.0 + pixel**2) * (area(piece) > 0.0)
-    share = overlap_share(tokens, targets, layout)
+    share = covered_share(tokens, targets, layout)
     bound: Floats = (common + share * whole) / (layout.areas.sum() - whole)
     return bound
 
@@ -207,7 +207,7 @@ def errors_of_shares(layout: Layout, size: int, pixels: int) -> tuple[Floats, Fl
         shares.append((wanted.rewards(world.picture()[None])[0] + 1.0) / 2.0)
     tokens, goals = layout.corners(states), layout.corners(targets)
     bound = camera_bound(layout, tokens, goals, sim.arena / pixels)
-    return np.array(shares) - overlap_share(tokens, goals, layout), bound
+    return np.array(shares) - covered_share(tokens, goals, layout), bound
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from tangram_core.seeding import episode_generator
 from tangram_core.setup import Setup
 from tangram_core.spec import Arrays, Episodes, joined
-from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.geometry.overlap import covered_share
 from tangram_tasks.env import PlaceEnv
 from tangram_tasks.played import Played
 from tests.agent.builders import PAIR, SQUARE, Policy, setup
@@ -50,7 +50,7 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
         corners.append(layout.corners(pose))
         placed.append(is_placed(moves))
         actions.append(action)
-        rewards.append(2.0 * overlap_share(corners[-1][None], goal[None], layout)[0] - 1.0)
+        rewards.append(2.0 * covered_share(corners[-1][None], goal[None], layout)[0] - 1.0)
     return {
         "corners": np.array(corners),
         "placed": np.array(placed),

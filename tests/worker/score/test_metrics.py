@@ -147,7 +147,7 @@ def test_refused_and_blocked_actions_are_counted() -> None:
     assert found.blocked.tolist() == [0, 1]
     assert found.actions_used.tolist() == [5, 7]
     assert found.means() == pytest.approx(
-        {"coverage": 1.0, "iou": 1.0, "share_solved": 1.0, "wrong": 0.0, "doubly_used": 0.0}
+        {"coverage": 1.0, "iou": 1.0, "solved": 1.0, "wrong": 0.0, "doubly_used": 0.0}
         | {"refused": 1.0, "blocked": 0.5, "actions_used": 6.0}
     )
 
@@ -245,8 +245,8 @@ def test_the_scores_of_a_known_set() -> None:
         {
             "mean_reward": 0.0,
             "mean_reward_dense": dense,
-            "raw_overlap": 0.5,
-            "raw_overlap_p10": 0.1,
+            "coverage": 0.5,
+            "coverage_p10": 0.1,
             "angle_error_deg_median": 5.0,
             "angle_error_deg_p90": 9.0,
             "position_error_median": 0.05,
