@@ -44,7 +44,7 @@ def test_it_runs_without_a_warning(
         assert np.min(names[told]) > 0.99
     if "over" in names:
         assert names["info"]["is_success"]
-    if "overlap" in names:
+    if "coverage" in names:
         assert names["coverage"] > 0.99
     if "model" in names:
         assert names["model"]._n_updates > 100
