@@ -1,6 +1,6 @@
-"""Settings and presets: what every command takes, composed and checked before anything is loaded.
+"""Settings and presets of all commands, composed and checked before anything heavy is loaded.
 
 Start with `commands.py`: each command and the dataclasses that declare its settings. `cli.py` is
-the entry that all commands share. The YAML files beside them are presets. Imports where settings
-are declared; read by files named `cli.py` only.
+the entry point of all commands. The YAML files are presets. May import modules that declare
+settings; only files named `cli.py` may import this package.
 """

@@ -1,4 +1,4 @@
-"""The arguments of a command before hydra sees them; what it would misread is refused."""
+"""Checks of a command's arguments before hydra reads them; what it would misread is refused."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +16,8 @@ def without_own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]
     """The folder of the user's own presets, None if none is named, and the other arguments.
 
     Raises:
-        ConfigError: no such folder, or a preset that is called as one of ours: hydra would take
-            ours without a word.
+        ConfigError: there is no such folder, or a preset has the name of one that comes with
+            tangram-rl, which hydra would take silently.
     """
     rest = [text for argument in arguments for text in _split_option(argument)]
     at = [number for number, text in enumerate(rest) if text in OWN_PRESETS]
@@ -32,17 +32,17 @@ def without_own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]
         taken = {path.stem for path in (folder / group).glob("*.yaml")} & set(choices(group))
         if taken:
             raise ConfigError(
-                f"{folder}/{group}/{min(taken)}.yaml is called as a preset that comes with "
+                f"{folder}/{group}/{min(taken)}.yaml has the name of a preset that comes with "
                 "tangram-rl: rename it"
             )
     return str(folder), rest[: at[0]] + rest[at[0] + 2 :]
 
 
 def options_first(arguments: Sequence[str], config_name: str) -> list[str]:
-    """The arguments in the order that hydra's parser insists on.
+    """The arguments in the order that hydra's parser needs: options first.
 
     Raises:
-        ConfigError: an option or an override that hydra would not take, or would misread.
+        ConfigError: an option or an override that hydra would refuse or misread.
     """
     options: list[str] = []
     overrides: list[str] = []
@@ -56,7 +56,7 @@ def options_first(arguments: Sequence[str], config_name: str) -> list[str]:
         elif argument.startswith("-"):
             name = argument.lstrip("-")
             raise ConfigError(
-                f"unknown option '{argument}': settings carry no dashes, as in "
+                f"unknown option '{argument}': settings have no dashes, as in "
                 f"{name if '=' in name else name + '=...'}; --help lists them"
             )
         else:
@@ -65,7 +65,7 @@ def options_first(arguments: Sequence[str], config_name: str) -> list[str]:
         options.append("job")
     if "--cfg" in options and any(one.startswith("from_config=") for one in overrides):
         raise ConfigError(
-            "--cfg shows presets and arguments alone: leave from_config out, or read it"
+            "--cfg shows presets and arguments only: leave from_config out, or read its file"
         )
     for override in overrides:
         _check_override(override, COMMANDS[config_name].over)
@@ -75,20 +75,20 @@ def options_first(arguments: Sequence[str], config_name: str) -> list[str]:
 
 
 def _check_override(override: str, over: Sequence[str]) -> None:
-    """Refuse what hydra would take for something else.
+    """Refuse what hydra would misread.
 
-    A list of presets it would merge, so that [square,square] is one square. What is taken away
-    would be as it is by default.
+    Hydra merges a list of presets, so that [square,square] would be one square. A removed setting
+    would have its default.
     """
     name, _, value = override.lstrip("+~").partition("=")
     if not name:
         raise ConfigError(unreadable(override))
     if override.startswith("~"):
-        raise ConfigError(f"'{override}': no setting is taken away, write {name}=value instead")
+        raise ConfigError(f"'{override}': a setting cannot be removed, write {name}=value instead")
     if name in over:
         raise ConfigError(
-            f"{override} chooses a preset, and a trained run has its own {name}: name another run, "
-            f"as run_dir=pretrained/hand, or set single values, as --help {name} lists them"
+            f"{override} chooses a preset, but a trained run has its own {name}: name another run, "
+            f"as in run_dir=pretrained/hand, or set single values, see --help {name}"
         )
     if name in GROUPS and value.startswith("["):
         remedy = f"; for several tokens write tokens.shapes={value}" if name == "tokens" else ""
@@ -96,7 +96,7 @@ def _check_override(override: str, over: Sequence[str]) -> None:
 
 
 def unreadable(override: object) -> str:
-    """The error of what is no name=value, for the user."""
+    """The error text for an argument that is not name=value."""
     return f"cannot read '{override}': write name=value, and quote texts with '...'"
 
 

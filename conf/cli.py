@@ -1,6 +1,6 @@
-"""The entry of every command: config, overrides, --help, and errors as one line.
+"""The entry point of every command: config, overrides, --help, and errors as one line.
 
-Nothing heavy is loaded before the command line is known to be in order, so --help is instant.
+Nothing heavy is loaded before the command line is checked, so --help is instant.
 """
 
 import difflib
@@ -41,14 +41,14 @@ from tangram_core.settings import CONTROL
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-# From the settings of a command: where the groups of a run are named, and these; None for nowhere.
+# Settings of a command -> name of a run's config and its groups; None: the settings name no run.
 Stored = Callable[[Plain], tuple[str, Plain] | None]
 
-MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
+MAKE_RUNS = ("train", "master")  # the commands that create their run_dir
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
     "run_dir": "say which run: run_dir=runs/...",
-    "connect": "say which run: connect=runs/..., or a copy of its connection.json",
+    "connect": "say which run: connect=runs/..., or connect= a copy of its connection.json",
 }
 
 
@@ -56,20 +56,21 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
     """Run a command and return its exit status.
 
     Args:
-        config_name: of the command, see `conf.commands.COMMANDS`.
+        config_name: key of the command in `conf.commands.COMMANDS`.
         task: takes the resolved config as plain containers and returns the exit status.
-        stored: the groups of a run that the settings name otherwise than by `from_config`.
+        stored: returns the groups of a run that the settings name by another setting than
+            `from_config`.
 
     Returns:
-        The task's status; 2 after a TangramError or a wrong command line, 75 where the environment
-        lacks something. These are told in one line on stderr.
+        The task's status; 2 after a TangramError or a wrong command line; 75 if the environment
+        lacks something. Errors are printed in one line on stderr.
     """
     command = COMMANDS[config_name].name
     arguments = sys.argv[1:]
     if "--version" in arguments:
         print(f"{command} {version('tangram-rl')}")
         return 0
-    gc.disable()  # composing makes much and drops nothing: collecting was a fifth of its time
+    gc.disable()  # composing frees almost nothing, and collecting took a fifth of its time
     try:
         folder, arguments = without_own_presets(arguments)
         arguments = with_named_code(arguments)
@@ -88,7 +89,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         kinds = kinds_of(arguments, folder, _stored_kinds(arguments))
         if TASK not in COMMANDS[config_name].groups:
             arguments = without_named_code(arguments)
-        elif stored is not None:  # the run that is joined says which modules; here they are named
+        elif stored is not None:  # arguments only allow the modules that the run names
             known = setting_names(config_name, kinds)
             arguments = [a for a in arguments if not names_modules(_key(a)) or _key(a) in known]
         options = [] if folder is None else [OWN_PRESETS[0], folder]
@@ -96,7 +97,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         sys.argv[1:] = [*options, *options_first(arguments, config_name)]
         return _run(config_name, task, stored, kinds)
     except TangramError as error:
-        # What a user gave may hold line breaks and the terminal's control characters.
+        # The user's input may hold line breaks and control characters of the terminal.
         line = CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(error))
         print(f"{command}: {line}", file=sys.stderr)
         return UNAVAILABLE_STATUS if isinstance(error, UnavailableError) else USAGE_STATUS
@@ -105,9 +106,9 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
 
 
 def tell(line: str) -> None:
-    """Show who waits at a terminal what takes its time: torch alone takes seconds to load.
+    """Print what the command waits for, if stderr is a terminal: loading torch takes seconds.
 
-    Not from a child, which shares the terminal with the process that started it.
+    A child process prints nothing, as it shares the terminal with its parent.
     """
     from tangram_core.run.process import VARIABLE
 
@@ -116,7 +117,7 @@ def tell(line: str) -> None:
 
 
 def _check_presets(folder: str | None) -> None:
-    """Raise ConfigError for a preset of the user's own that is broken or empty."""
+    """Raise ConfigError for a broken or empty preset in the user's folder."""
     if folder is None:
         return
     from omegaconf import OmegaConf
@@ -125,9 +126,7 @@ def _check_presets(folder: str | None) -> None:
     from tangram_core.store.stored import check_extent
 
     if Path(folder, "hydra").exists():
-        raise ConfigError(
-            f"{OWN_PRESETS[0]}: {folder}/hydra sets hydra's own settings: take it away"
-        )
+        raise ConfigError(f"{OWN_PRESETS[0]}: {folder}/hydra sets hydra's own settings: remove it")
     for path in (path for group in GROUPS for path in Path(folder, group).rglob("*.yaml")):
         try:
             check_extent(path.read_text(encoding="utf-8"), f"preset {path}")
@@ -140,10 +139,10 @@ def _check_presets(folder: str | None) -> None:
             OmegaConfBaseException,
         ) as error:
             why = " ".join(str(error).split()) or type(error).__name__
-            raise ConfigError(f"preset {path} cannot be read ({why}): mend it") from None
+            raise ConfigError(f"preset {path} cannot be read ({why}): correct it") from None
         if not (content and isinstance(content, dict)):
             raise ConfigError(f"preset {path} sets nothing: write settings as in name: value")
-        # Hydra's own settings may name functions that are called.
+        # Hydra's settings may name functions, which hydra calls.
         if "hydra" in str(content) or "@package" in path.read_text(encoding="utf-8"):
             raise ConfigError(
                 f"preset {path} sets more than its group: leave hydra and @package out"
@@ -153,7 +152,7 @@ def _check_presets(folder: str | None) -> None:
 def _run(
     config_name: str, task: Callable[[Plain], int], stored: Stored | None, kinds: Kinds
 ) -> int:
-    """Hand over to hydra, so that its --multirun and --cfg work as everywhere."""
+    """Run a command through hydra, so that its --multirun and --cfg work."""
     import hydra
     from hydra.errors import HydraException
     from omegaconf import DictConfig
@@ -167,11 +166,11 @@ def _run(
         try:
             statuses.append(task(_plain(config, stored, config_name, kinds)))
         except (TangramError, OSError, MemoryError) as error:
-            # An exception that hydra sees costs two more lines; an exit passes through it.
+            # Hydra would print two more lines for an exception, but none for an exit.
             errors.append(_as_ours(error))
             raise SystemExit(USAGE_STATUS) from None
 
-    # Without it hydra prints errors of the command line itself, over several lines.
+    # Without this variable hydra prints errors of the command line over several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     _register(config_name, kinds)
     try:
@@ -198,7 +197,7 @@ def _run(
 
 
 def _composed_once(config_name: str, overrides: list[str]) -> "DictConfig":
-    """The config of a command line without options; `hydra.main` composes it twice."""
+    """The config of a command line without options; `hydra.main` would compose it twice."""
     import hydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import open_dict
@@ -211,7 +210,7 @@ def _composed_once(config_name: str, overrides: list[str]) -> "DictConfig":
 
 
 def _as_ours(error: Exception) -> TangramError:
-    """A full disk, missing permission or too little memory as an error of one line."""
+    """An error of disk, permission or memory as a TangramError with a remedy."""
     kind = UnavailableError if is_passing(error) else TangramError
     if isinstance(error, TangramError):
         return kind(str(error))
@@ -227,10 +226,10 @@ def _as_ours(error: Exception) -> TangramError:
 
 
 def _plain(config: Any, stored: Stored | None, config_name: str, kinds: Kinds) -> Plain:
-    """Hydra's config as plain containers, with nothing missing and everything resolved.
+    """Hydra's config as plain containers, complete and resolved.
 
     Raises:
-        ConfigError: a setting without a default was not given, or an interpolation fails.
+        ConfigError: a needed setting is missing, or an interpolation fails.
     """
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
@@ -248,16 +247,16 @@ def _plain(config: Any, stored: Stored | None, config_name: str, kinds: Kinds) -
     plain = _own(_mapping(settings), overrides, kinds)
     in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN and config_name in MAKE_RUNS
     if in_sweep and isinstance(plain.get("run_dir"), str):
-        # The jobs of one sweep start at one time and share their arguments: a folder for each.
+        # The jobs of a sweep have the same start time and arguments: give each its own folder.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
     return with_named_reward(with_run_config(plain, overrides, stored), overrides)
 
 
 def composed(config_name: str, overrides: Sequence[str]) -> Plain:
-    """The config that a command makes of its arguments; within a task its own presets are known.
+    """The config of a command for some arguments, also inside a running command.
 
     Raises:
-        ConfigError: an argument that it would refuse.
+        ConfigError: an argument that the command would refuse.
     """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
@@ -279,10 +278,10 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
 
 
 def _own(settings: Plain, overrides: Sequence[str], kinds: Kinds) -> Plain:
-    """The settings that task and agent have: a set of tokens may bring those of a world, too.
+    """The settings without sections that task and agent do not have, which a preset may set.
 
     Raises:
-        ConfigError: an argument sets one that they have not.
+        ConfigError: an argument sets a value in such a section.
     """
     other = {*GROUPS} - {*kinds.sections()}
     for name in map(_key, overrides):
@@ -292,7 +291,7 @@ def _own(settings: Plain, overrides: Sequence[str], kinds: Kinds) -> Plain:
 
 
 def _register(config_name: str, kinds: Kinds) -> None:
-    """Tell hydra of a command: its defaults list, and the defaults that its settings declare."""
+    """Register a command with hydra: its defaults list and the declared defaults."""
     from hydra.core.config_store import ConfigStore
 
     ConfigStore.instance().store(name=config_name, node=COMMANDS[config_name].node(kinds))
@@ -310,17 +309,17 @@ def _mapping(container: object) -> Plain:
 def with_run_config(
     settings: Plain, overrides: Sequence[str], stored: Stored | None = None
 ) -> Plain:
-    """Replace the groups by those of the run that `from_config` names; the key itself goes.
+    """Replace the groups by those of the run that `from_config` names, and drop `from_config`.
 
-    Single values that were set on the command line still win.
+    Single values on the command line override those of the run.
 
     Args:
-        settings: of the command.
-        overrides: as they were given.
-        stored: asked for the groups where `from_config` is not set.
+        settings: settings of the command.
+        overrides: arguments of the command line.
+        stored: called for the groups if `from_config` is not set.
 
     Raises:
-        ConfigError: no such file, not a run's config, or an override chooses a whole group.
+        ConfigError: there is no such file, it is no run's config, or an override chooses a preset.
     """
     from omegaconf import OmegaConf
 
@@ -343,17 +342,17 @@ def with_run_config(
         if key == section:
             raise ConfigError(
                 f"{source} chooses {section} already: leave out {override}, "
-                f"or set single values as in {section}.name=value"
+                f"or set single values, as in {section}.name=value"
             )
         OmegaConf.update(result, key, OmegaConf.select(chosen, key))
     return _mapping(OmegaConf.to_container(result))
 
 
 def _sections_of_a_run(content: Plain, source: str) -> Plain:
-    """Those that the run's task and agent have, and the service's.
+    """The sections of a run's config for its task, agent and service.
 
     Raises:
-        ConfigError: it is not a run's config.
+        ConfigError: the content is no run's config.
     """
     from tangram_core.setup import section_names
 
@@ -368,22 +367,22 @@ def _sections_of_a_run(content: Plain, source: str) -> Plain:
 
 
 def _stored_kinds(arguments: Sequence[str]) -> Plain | None:
-    """The config that the arguments name by `from_config`, if it can be read; else nothing yet."""
+    """The content of the file in `from_config`; None if there is none or it cannot be read."""
     named = [unquoted(text.partition("=")[2]) for text in arguments if _key(text) == "from_config"]
     if not named:
         return None
     try:
         found = _from_config({"from_config": named[-1]})
-    except ConfigError:  # told later, with the rest of the command line
+    except ConfigError:  # reported later, with the rest of the command line
         return None
     return None if found is None else found[1]
 
 
 def with_named_reward(settings: Plain, overrides: Sequence[str]) -> Plain:
-    """Refuse a reward that a run's settings, or a preset, name and the command line does not.
+    """Refuse a reward file that a run's settings or a preset name, but not the command line.
 
     Raises:
-        ConfigError: says which file, and what to add.
+        ConfigError: names the file and the argument to add.
     """
     from tangram_sim.config import with_given_reward
 
@@ -413,7 +412,7 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
     except OSError as error:
         raise ConfigError(f"{source}: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"{source} is not valid YAML (it is no UTF-8): mend it") from None
+        raise ConfigError(f"{source} is not valid YAML (it is no UTF-8): correct it") from None
     return source, content if isinstance(content, dict) else {}
 
 
@@ -421,7 +420,7 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
 
 
 def _explain(error: Exception, config_name: str, kinds: Kinds) -> str:
-    """What is wrong with the command line and what to write instead."""
+    """The error text for a wrong command line, with a remedy."""
     from hydra.errors import MissingConfigException, OverrideParseException
 
     if isinstance(error, MissingConfigException):
@@ -433,10 +432,10 @@ def _explain(error: Exception, config_name: str, kinds: Kinds) -> str:
     if isinstance(error, RecursionError):
         return "the arguments are nested too deeply: write fewer brackets"
     if str(error).startswith("Config group override must be"):
-        return "a config group takes the name of a preset, and no number: --help lists them"
+        return "a config group takes the name of a preset, not a number: --help lists them"
     if "Ambiguous value" in str(error):
         return (
-            f"{_first_line(error)}: a list is [1,2], a text is '1,2', several runs are --multirun"
+            f"{_first_line(error)}: write [1,2] for a list, '1,2' for a text, --multirun for runs"
         )
     unknown = re.search(r"Could not override '([^']+)'|'([^']+)' does not exist", str(error))
     if unknown:

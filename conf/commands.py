@@ -1,7 +1,7 @@
-"""The commands: what each is for, and which settings it takes, as their dataclasses declare them.
+"""The commands: purpose, examples, and the dataclasses that declare their settings.
 
-A config is made of the declared defaults, then of the presets that are chosen, then of what stands
-on the command line. The YAML files beside this one hold presets only: what differs from the
+A config is made from the declared defaults, then the chosen presets, then the command line; later
+values win. The YAML files in this folder are presets, which set only what differs from the
 defaults.
 """
 
@@ -16,11 +16,11 @@ from tangram_core.settings import Settings, declared_fields, setting
 
 Plain = dict[str, Any]
 USUAL = Kinds()
-NEEDED = "???"  # hydra's word for a value that must be given
+NEEDED = "???"  # hydra's mark of a value that must be given
 
-# In this order presets are merged. A task brings its world; an agent brings its own net and pace,
-# net=... and service=... on the command line win; a set of several tokens comes last, as it brings
-# its starts.
+# Presets are merged in this order. A task also sets `sim`. An agent also sets `net` and `service`,
+# but net=... and service=... on the command line win. `tokens` comes last, as a set of several
+# tokens also sets `sim` and `service`.
 GROUPS = ("task", "sim", "reward", "net", "service", "agent", "tokens")
 RUN: dict[str, str | list[str]] = {
     "sim": "physics",
@@ -37,10 +37,10 @@ NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
 
 @dataclass(frozen=True)
 class StoredConfig(Settings):
-    """Settings in place of groups."""
+    """Setting that replaces the config groups."""
 
     from_config: str | None = setting(
-        None, "config.yaml of a run: takes its groups instead; single values still override"
+        None, "config.yaml of a run, used instead of presets; single values on the command line win"
     )
 
 
@@ -49,13 +49,13 @@ class Command:
     """A console script.
 
     Attributes:
-        name: of the script.
-        about: what it does, for --help.
-        examples: three lines.
-        settings: the dataclasses that declare its own settings, as `module:Class`.
-        groups: config group -> presets that are taken by default.
+        name: name of the script.
+        about: purpose, for --help.
+        examples: three command lines.
+        settings: dataclasses that declare the command's own settings, as `module:Class`.
+        groups: config group -> default presets.
         given: own setting -> default that hydra fills in.
-        over: sections of a trained run, of which any setting can be laid over the run's.
+        over: sections of a trained run whose settings the command can replace.
     """
 
     name: str
@@ -67,17 +67,17 @@ class Command:
     over: tuple[str, ...] = ()
 
     def fields(self) -> list["Field[Any]"]:
-        """Its own settings."""
+        """The command's own settings, without those of config groups."""
         return [own for name in self.settings for own in declared_fields(load(name))]
 
     def defaults(self) -> Plain:
-        """Its own settings with their defaults."""
+        """Own setting -> default."""
         return {own.name: self.given.get(own.name, plain_default(own)) for own in self.fields()}
 
     def chosen(self, kinds: Kinds) -> dict[str, str | list[str] | None]:
-        """Config group -> presets, of the groups that a task and an agent have.
+        """Config group -> default presets, for the groups of a task and an agent.
 
-        None: those by default are of another task or agent than is played.
+        None: the default presets are for another task or agent.
         """
         known, usual = kinds.sections(), USUAL.named()
         other = {role for role, kind in kinds.named().items() if kind != usual[role]}
@@ -85,9 +85,9 @@ class Command:
         return groups | dict.fromkeys(other & groups.keys())
 
     def sections(self, kinds: Kinds = USUAL) -> dict[str, Plain]:
-        """Group -> setting -> default, of the groups whose settings are declared.
+        """Group -> setting -> default, for the groups of the command.
 
-        What is laid over a run has no default: null is as the run was trained.
+        A setting that can replace one of a trained run has the default None: the run's value.
         """
         known, named = kinds.sections(), kinds.named()
         given = {
@@ -101,7 +101,7 @@ class Command:
         return given | over
 
     def node(self, kinds: Kinds = USUAL) -> Plain:
-        """What hydra is told: defaults list, declared defaults, and its own behaviour."""
+        """Config node for hydra: defaults list, declared defaults and hydra's own settings."""
         chosen = [{group: preset} for group, preset in self.chosen(kinds).items()]
         return {
             "defaults": ["_self_", *chosen],
@@ -112,30 +112,30 @@ class Command:
 
 
 def declared(section: type[Settings] | None) -> list["Field[Any]"]:
-    """The settings of a section, if it has any."""
+    """The settings of a section; empty for None."""
     return [] if section is None else declared_fields(section)
 
 
 def laid_over(group: str, own: Kinds = USUAL) -> dict[str, "Field[Any]"]:
-    """The settings that may be laid over a run's, of whatever kind it is, by their names.
+    """Name -> setting of a group that can replace one of a trained run, for all kinds.
 
     Args:
-        group: of settings.
-        own: a task and an agent that do not come with the package.
+        group: name of the group.
+        own: a further task and agent, such as the user's own.
     """
     every = [kinds.sections().get(group) for kinds in (*every_kind(group), own)]
     return {own.name: own for section in every for own in declared(section)}
 
 
 def load(name: str) -> type[Settings]:
-    """The dataclass that `module:Class` names."""
+    """Import the dataclass that `module:Class` names."""
     module, _, kind = name.partition(":")
     loaded: type[Settings] = getattr(import_module(module), kind)
     return loaded
 
 
 def plain_default(own: "Field[Any]") -> Any:
-    """A setting's default as YAML has it."""
+    """The default of a setting as YAML value; ??? if it must be given."""
     return NEEDED if own.default is MISSING else _plain(own.default)
 
 
@@ -146,7 +146,7 @@ def _plain(value: Any) -> Any:
 
 
 def _quiet() -> Plain:
-    """The commands make their own folders and logs; hydra adds none."""
+    """Settings that keep hydra from adding folders and logs of its own."""
     return {
         "run": {"dir": "."},
         "sweep": {
@@ -163,9 +163,9 @@ COMMANDS = {
     "train": Command(
         "tangram-train",
         """\
-Trains an agent on this machine. It starts a master that learns, workers that play and an
-evaluator, shows the progress, and leaves a run folder with the config, checkpoints,
-TensorBoard curves, result.json and a picture of test episodes.""",
+Trains an agent on this machine. It starts a master that learns, workers that play episodes, and
+an evaluator that plays test episodes. It shows the progress and writes a run folder: config,
+checkpoints, TensorBoard curves, result.json and a picture of test episodes.""",
         (
             "tangram-train",
             "tangram-train tokens=parallelogram seed=1 workers=2 run_dir=runs/parallelogram_1",
@@ -181,8 +181,9 @@ TensorBoard curves, result.json and a picture of test episodes.""",
     "master": Command(
         "tangram-master",
         """\
-Learns. It waits for workers, keeps what they played in a replay buffer, updates the agent
-and broadcasts its weights. Where to join stands in connection.json in the run folder.""",
+Trains an agent with workers that are started by hand, also on other machines. It waits for
+workers, stores their episodes in a replay buffer, updates the agent and broadcasts its weights.
+Workers join with the file connection.json in the run folder.""",
         (
             "tangram-master run_dir=runs/shared service.bind=0.0.0.0 service.port=5555",
             "tangram-master from_config=runs/shared/config.yaml run_dir=runs/shared resume=auto",
@@ -195,10 +196,10 @@ and broadcasts its weights. Where to join stands in connection.json in the run f
     "worker": Command(
         "tangram-worker",
         """\
-Plays. It joins a master, plays episodes with the newest weights and sends them. A run's
-folder, or a copy of its connection.json, is all that it needs. An address alone is enough
-where the master has service.auth=off: then task, tokens, sim, reward, agent and net must be given
-and be the master's, or it is refused and told what differs.""",
+Plays episodes for a master: it joins, plays with the newest weights and sends the episodes. It
+needs only the run's folder, or a copy of its connection.json. If the master has service.auth=off,
+an address is enough. Then give the same task, tokens, sim, reward, agent and net as the master;
+else the master refuses the worker and names the difference.""",
         (
             "tangram-worker connect=runs/shared",
             "tangram-worker connect=learner.json service.envs=64",
@@ -211,9 +212,9 @@ and be the master's, or it is refused and told what differs.""",
     "status": Command(
         "tangram-status",
         """\
-Says how a run stands: what it does or waits for, its workers, how fast they are, how old
-their weights and the last checkpoint are. It asks the master, from wherever a worker may be;
-`watch tangram-status connect=...` asks every two seconds.""",
+Shows the status of a run: its current activity, its workers and their speed, the age of their
+weights and of the last checkpoint. It asks the master, so it works on every machine where a
+worker works. `watch tangram-status connect=...` repeats it every two seconds.""",
         (
             "tangram-status connect=runs/my_run",
             "tangram-status connect=learner.json",
@@ -224,13 +225,12 @@ their weights and the last checkpoint are. It asks the master, from wherever a w
     "keys": Command(
         "tangram-keys",
         """\
-Says who has a key to a run whose master listens on an address, makes a key for somebody
-else, and takes it back, all while the run goes on. The master must have started on an
-address before, as with service.bind=0.0.0.0. The new key lies in a connection file of its
-own, which is all that the other one needs. Who joined, left and was refused stands in
-audit.jsonl in the run folder.""",
+Lists, adds and revokes the keys with which other people's workers can join a run. The run need
+not stop. Its master must have started once with an address, as with service.bind=0.0.0.0. A new
+key is written to a connection file of its own. Send this file to its owner, who needs nothing
+else. The file audit.jsonl in the run folder records who joined, left and was refused.""",
         (
-            "tangram-keys run_dir=runs/shared    # who has keys; changes nothing",
+            "tangram-keys run_dir=runs/shared    # lists keys; changes nothing",
             "tangram-keys run_dir=runs/shared add=alice role=evaluator    # makes alice.json",
             "tangram-keys run_dir=runs/shared revoke=alice    # ends alice's process, too",
         ),
@@ -239,10 +239,10 @@ audit.jsonl in the run folder.""",
     "eval": Command(
         "tangram-eval",
         """\
-Scores a run. It plays test episodes with the newest weights of a run, noise off, and prints
-mean reward, raw overlap and the errors in position and angle. With several tokens it prints
-how much of the target is covered and how many are solved (95 % covered), and plays puzzles:
-those that come with tangram-rl or your own, see docs/puzzles.md.""",
+Scores a run. It plays test episodes with the newest weights of the run, without exploration noise,
+and prints the scores of the task. For one token these are coverage, mean reward and the errors in
+position and angle. For several tokens they include the share of solved targets (95 % covered).
+With puzzle= it plays puzzles of tangram-rl or your own, see docs/puzzles.md.""",
         (
             "tangram-eval run_dir=runs/my_run episodes=1000 out=scores.json",
             "tangram-eval run_dir=runs/my_run sim.actions_per_token=3 sim.backend=kinematic",
@@ -254,11 +254,11 @@ those that come with tangram-rl or your own, see docs/puzzles.md.""",
     "play": Command(
         "tangram-play",
         """\
-Shows a run. It plays episodes with the newest weights of a run, noise off, and draws them.
-It assembles puzzles: those that come with tangram-rl or your own, see docs/puzzles.md.
-With target=FILE it takes what you have, a drawing, a black figure, a photograph or a puzzle, says
-what it took it for, and lays it, or what comes nearest to it; see docs/silhouettes.md. With
-out=solution.json or .svg it writes where each token lies.""",
+Shows a run. It plays episodes with the newest weights of the run, without exploration noise, and
+draws them. With puzzle= it assembles puzzles of tangram-rl or your own, see docs/puzzles.md.
+With target=FILE it takes a figure from a drawing, a black figure, a photograph or a puzzle file.
+It prints how it read the file, and assembles the figure or the nearest to it that it finds; see
+docs/silhouettes.md. With out=solution.json or out=solution.svg it writes where each token lies.""",
         (
             "tangram-play run_dir=runs/my_run out=tests.png episodes=20",
             "tangram-play puzzle=cat out=cat.gif",
@@ -270,10 +270,11 @@ out=solution.json or .svg it writes where each token lies.""",
     "export": Command(
         "tangram-export",
         """\
-Writes an agent as an ONNX file, which onnxruntime plays in any language without torch: an action
-of the fields that the task shows, by their names, for any number of rows. It plays 1,000
-observations both ways first, and writes nothing if they are more than 1e-5 apart. Needs the extra
-onnx; agents that search (outline, push) are more than a network and are refused.""",
+Writes an agent as an ONNX file, which onnxruntime runs in many languages without torch. Its inputs
+are the task's observed fields by name, with any number of rows; its output is the actions. First
+it compares the agent and the file on 1,000 observations. If an action differs by more than 1e-5,
+it writes nothing. It needs the packages onnx, onnxscript and onnxruntime. Agents that search
+(outline, push) are more than a network and cannot be exported.""",
         (
             "tangram-export run_dir=runs/my_run out=agent.onnx",
             "tangram-export run_dir=pretrained/tangram7 out=runs/tangram7.onnx",
@@ -285,22 +286,22 @@ onnx; agents that search (outline, push) are more than a network and are refused
     "studio": Command(
         "tangram-studio",
         """\
-Serves a page to play on, on this machine alone, and prints its address, which has a token
-in it. Choose, lay out, draw or drop a figure: the agent says how seven tans fill it and lays
-it, while you may take tans away.""",
+Serves a web page to play on, for this machine only. It prints the page's address, which has a
+secret in it. Choose, arrange, draw or drop a figure: the agent finds how the seven tans fill it
+and lays them. Meanwhile you may take tans away.""",
         (
             "tangram-studio",
             "tangram-studio port=9000",
-            "tangram-studio port=0    # any free one",
+            "tangram-studio port=0    # any free port",
         ),
         ("tangram_studio.config:StudioConfig",),
     ),
     "experiments": Command(
         "tangram-experiment",
         """\
-Runs a study of conf/studies.yaml: every training over its seeds, then its tests. Each test adds
-rows to STUDY.csv; what has its rows is skipped, and what was cut goes on from its checkpoint, so
-the same command can be given again and again. tangram-report draws what is there.""",
+Runs a study of conf/studies.yaml: each training with several seeds, then its tests. Each test adds
+rows to STUDY.csv. After an interruption, give the same command again: it skips finished tests, and
+unfinished trainings go on from their checkpoints. tangram-report draws the results.""",
         (
             "tangram-experiment budget=smoke",
             "tangram-experiment study=paper budget=paper jobs=4",
@@ -312,12 +313,12 @@ the same command can be given again and again. tangram-report draws what is ther
     "report": Command(
         "tangram-report",
         """\
-Draws tables (Markdown) and figures (PNG) of every STUDY.csv of a folder, as tangram-experiment
-wrote it. Of a folder whose folders are runs, such as a sweep's, it makes one table.""",
+Draws tables (Markdown) and figures (PNG) from every STUDY.csv in a folder, as tangram-experiment
+writes them. From a folder of run folders, such as a sweep's, it makes one table.""",
         (
             "tangram-report runs=runs/experiments/laptop",
             "tangram-report runs=runs/my_sweep out=report",
-            "tangram-report check=true    # or: check. In a clone: pages against results",
+            "tangram-report check=true    # in a clone: are the scores of all pages right?",
         ),
         ("tangram_lab.experiments.cli:ReportConfig",),
     ),

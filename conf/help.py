@@ -1,6 +1,6 @@
-"""What --help prints, made of what the settings' declarations say, so that it cannot go stale.
+"""The text of --help, made from the declarations of settings, so that it is always up to date.
 
-Hydra is not loaded for it: a command's help does not wait.
+Hydra is not loaded, so that --help is instant.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,16 +18,16 @@ WIDTH = 96
 
 
 def help_text(config_name: str, folder: str | None = None, kinds: Kinds = USUAL) -> str:
-    """What --help prints: purpose, groups, settings and examples.
+    """The text of --help: purpose, groups, settings and examples.
 
     Args:
-        config_name: of the command.
-        folder: of the user's own presets.
-        kinds: of task and agent.
+        config_name: key of the command in `COMMANDS`.
+        folder: folder of the user's own presets.
+        kinds: task and agent of the command line.
     """
     command = COMMANDS[config_name]
     choice = " | group=choice" if command.groups else ""
-    inside = ["  --help sim   the settings of a group"] if command.sections(kinds) else []
+    inside = ["  --help sim   print the settings of a group"] if command.sections(kinds) else []
     return "\n".join(
         [
             f"{command.name} [setting=value{choice}] ...",
@@ -40,9 +40,9 @@ def help_text(config_name: str, folder: str | None = None, kinds: Kinds = USUAL)
             *_over_text(command),
             "",
             "Options:",
-            "  --cfg job    show the whole config that the other arguments make, and end",
-            "  --multirun   run once for each of several values, as in seed=0,1,2",
-            "  --config-dir DIR  a folder of your own presets, as DIR/tokens/mine.yaml",
+            "  --cfg job    print the whole config that the other arguments give, and exit",
+            "  --multirun   run once for each value in a list, as in seed=0,1,2",
+            "  --config-dir DIR  use your own presets, as in DIR/tokens/mine.yaml for tokens=mine",
             *inside,
             "  --version, --help",
             "",
@@ -55,9 +55,9 @@ def help_text(config_name: str, folder: str | None = None, kinds: Kinds = USUAL)
 def group_help(
     config_name: str, group: str, folder: str | None = None, kinds: Kinds = USUAL
 ) -> str:
-    """What `--help GROUP` prints: its presets, and each of its settings that the command takes."""
+    """The text of `--help GROUP`: the presets and settings of the group."""
     if group in COMMANDS[config_name].over:
-        first = f"{group}.name=value: in place of what the run was trained with"
+        first = f"{group}.name=value replaces the value of the run; null keeps it"
         lines = [_line(own, "null", group) for own in playable(group).values()]
     else:
         first = f"{group}={'|'.join(choices(group, folder))}"
@@ -67,17 +67,17 @@ def group_help(
 
 
 def playable(group: str) -> dict[str, "Field[Any]"]:
-    """The settings of a group that may be others when a trained run plays, by their whole names."""
+    """Full name -> setting of a group that may be changed when a trained run plays."""
     every = laid_over(group).items()
     return {f"{group}.{name}": own for name, own in every if own.metadata[KEY].part == PLAY}
 
 
 def choices(group: str, folder: str | None = None) -> list[str]:
-    """The presets of a config group.
+    """Names of the presets of a config group.
 
     Args:
-        group: its name.
-        folder: of the user's own presets.
+        group: name of the group.
+        folder: folder of the user's own presets.
     """
     places = [files("conf") / group, *([] if folder is None else [Path(folder) / group])]
     entries = [entry.name for place in places if place.is_dir() for entry in place.iterdir()]
@@ -85,13 +85,13 @@ def choices(group: str, folder: str | None = None) -> list[str]:
 
 
 def group_defaults(command: Command, kinds: Kinds) -> dict[str, list[str]]:
-    """Config group -> presets that a command takes by default."""
+    """Config group -> default presets of a command."""
     groups = command.chosen(kinds).items()
     return {group: [name] if isinstance(name, str) else name or [] for group, name in groups}
 
 
 def setting_names(config_name: str, kinds: Kinds = USUAL) -> list[str]:
-    """Dotted names of all settings and groups of a command."""
+    """Full names of all settings and groups of a command."""
     command = COMMANDS[config_name]
     names = [*command.defaults(), *command.chosen(kinds)]
     names += [
@@ -101,7 +101,7 @@ def setting_names(config_name: str, kinds: Kinds = USUAL) -> list[str]:
 
 
 def told_default(value: Any) -> str:
-    """A default as it is written on a command line."""
+    """A default as text, as on a command line."""
     if isinstance(value, list):
         return f"[{','.join(map(told_default, value))}]"
     if isinstance(value, Mapping):
@@ -113,7 +113,7 @@ def _groups_text(command: Command, folder: str | None, kinds: Kinds) -> Iterator
     if not command.groups:
         return
     yield ""
-    yield "Config groups (* is the default):"
+    yield "Config groups and their presets, chosen as in sim=kinematic (* is the default):"
     for group, default in group_defaults(command, kinds).items():
         names = [f"{n}*" if n in default else n for n in choices(group, folder)]
         names += ["or path/to/file.py:Name"] if group in kinds.named() else []
@@ -121,8 +121,8 @@ def _groups_text(command: Command, folder: str | None, kinds: Kinds) -> Iterator
             f"{group:<8} {', '.join(names)}", WIDTH, initial_indent="  ", subsequent_indent=" " * 11
         )
     if "agent" in command.groups:
-        yield "Their values are settings too, as in agent.noise=0.1, tokens.shapes=[square,square];"
-    yield f"`{command.name} --cfg job` shows all of their values."
+        yield "Set single values as in agent.noise=0.1 or tokens.shapes=[square,square]."
+    yield f"`{command.name} --cfg job` prints all values."
 
 
 def _over_text(command: Command) -> Iterator[str]:
@@ -130,8 +130,8 @@ def _over_text(command: Command) -> Iterator[str]:
         return
     yield ""
     sections = ", ".join(command.over)
-    yield f"Besides, settings of {sections} in place of what the run was trained with, as in"
-    yield "agent.reapply=1. What was for learning only, or is built into the weights, is refused."
+    yield f"Settings of {sections} can replace those of the run, as in agent.reapply=1."
+    yield "Settings for learning only, and settings that the weights depend on, are refused."
 
 
 def _setting_lines(command: Command) -> Iterator[str]:

@@ -1,6 +1,6 @@
-"""Which task and which agent a command line means, and with them the sections of its settings.
+"""The task and the agent that a command line names, and with them its sections of settings.
 
-Known before hydra composes anything: a preset says `kind: NAME`, or goes out from one that does.
+They are found before hydra composes the config: a preset, or one in its defaults, has `kind: NAME`.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import Settings
 
 Sections = dict[str, type[Settings] | None]
-MAX_STEPS = 16  # from a preset to the one that it goes out from
+MAX_STEPS = 16  # longest chain of presets, each in the defaults of the one before
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,17 @@ class Kinds:
     agent: str = "pair"
 
     def sections(self) -> Sections:
-        """Section -> the dataclass that declares its settings; None: it names the kind alone."""
+        """Section -> dataclass of its settings; None if the section has only `kind`."""
         task, agent = find_task(self.task).sections, find_agent(self.agent).sections
         return {TASK: None, **task, AGENT: None, **agent, "service": ServiceConfig}
 
     def named(self) -> dict[str, str]:
-        """Section -> the kind that stands in it."""
+        """Section -> value of its `kind`."""
         return {"task": self.task, "agent": self.agent}
 
 
 def every_kind(group: str) -> list[Kinds]:
-    """The kinds that come with the package, of the role that a group is of; else the usual ones."""
+    """All kinds of tangram-rl for the group task or agent; for other groups the default kinds."""
     if group == TASK:
         return [Kinds(task=kind) for kind in OURS["task"]]
     return [Kinds(agent=kind) for kind in OURS["agent"]] if group == AGENT else [Kinds()]
@@ -48,15 +48,15 @@ def every_kind(group: str) -> list[Kinds]:
 def kinds_of(
     arguments: Sequence[str], folder: str | None = None, stored: dict[str, Any] | None = None
 ) -> Kinds:
-    """What arguments of a command mean.
+    """The task and the agent that the arguments of a command name.
 
     Args:
-        arguments: as they were given.
-        folder: of the user's own presets.
-        stored: the config of a run that they go out from.
+        arguments: arguments of the command line.
+        folder: folder of the user's own presets.
+        stored: config of the run in `from_config`.
 
     Raises:
-        ConfigError: a sweep over presets of several kinds.
+        ConfigError: a sweep has presets of several kinds.
     """
     usual = Kinds()
     found = {role: _chosen(role, arguments, folder, stored) for role in (TASK, AGENT)}
@@ -64,7 +64,7 @@ def kinds_of(
 
 
 def with_usual_agent(arguments: Sequence[str], folder: str | None = None) -> list[str]:
-    """The arguments of a new run; where they name a task and no agent, the one that it names."""
+    """The arguments of a new run, with the task's default agent if they name only a task."""
     given = {one.lstrip("+").partition("=")[0] for one in arguments if "=" in one}
     task = _chosen(TASK, arguments, folder, None)
     if task in (None, Kinds().task) or given & {AGENT, f"{AGENT}.{KIND}", "from_config"}:
@@ -84,7 +84,7 @@ def _chosen(
         kinds = {_kind(role, preset, folder) for preset in presets[-1].split(",")}
         if len(kinds) > 1:
             raise ConfigError(
-                f"{role}={presets[-1]}: a sweep is over presets of one kind: give a sweep for each"
+                f"{role}={presets[-1]}: a sweep takes presets of one kind: start a sweep for each"
             )
         return kinds.pop()
     section = None if stored is None else stored.get(role)
@@ -93,7 +93,7 @@ def _chosen(
 
 
 def _kind(role: str, preset: str, folder: str | None) -> str | None:
-    """The kind that a preset says, or one that it goes out from; None: nobody says it."""
+    """The kind in a preset, or in one of its defaults; None: there is none."""
     for _ in range(MAX_STEPS):
         content = _read(role, preset, folder)
         if isinstance(content.get(KIND), str):
@@ -107,7 +107,7 @@ def _kind(role: str, preset: str, folder: str | None) -> str | None:
 
 
 def _read(role: str, preset: str, folder: str | None) -> dict[str, Any]:
-    """A preset; nothing where it is missing or broken, which is told later."""
+    """The content of a preset; empty if it is missing or broken, which is reported later."""
     places = [files("conf") / role, *([] if folder is None else [Path(folder) / role])]
     for place in places:
         path = place / f"{preset}.yaml"

@@ -1,7 +1,7 @@
-"""Code of the user's own on a command line: loaded here, and nowhere else.
+"""The user's own code on a command line, which is loaded only here.
 
-A task or an agent that no preset names, from a file or from another package, is written for hydra
-as its kind: agent=td3.py:TD3 as agent.kind=td3.py:TD3.
+A task or an agent from a file or from another package has no preset. So it is passed to hydra as
+its kind: agent=td3.py:TD3 becomes agent.kind=td3.py:TD3.
 """
 
 from collections.abc import Sequence
@@ -15,16 +15,16 @@ ROLES: tuple[Role, ...] = ("task", "agent")
 
 
 def with_named_code(arguments: Sequence[str]) -> list[str]:
-    """Load the code that arguments name, and write them as hydra takes them.
+    """Load the code that arguments name; return the arguments for hydra.
 
     Raises:
-        ConfigError: code that cannot be loaded.
+        ConfigError: the code cannot be loaded.
     """
     return [_named(argument) for argument in arguments]
 
 
 def without_named_code(arguments: Sequence[str]) -> list[str]:
-    """For a command that plays trained runs, which have a task and an agent already."""
+    """Drop arguments that name code, for commands that play a run with its task and agent."""
     kinds = {f"{role}.{KIND}": role for role in ROLES}
 
     def brought(argument: str) -> bool:
@@ -44,7 +44,7 @@ def _named(argument: str) -> str:
     for role in ROLES:
         if name in (role, f"{role}.{KIND}") and own_code(plain) is not None:
             if "," in plain:
-                raise ConfigError(f"{argument}: one file at a time: give a sweep for each")
+                raise ConfigError(f"{argument}: name one file at a time: start a sweep for each")
             load_own(role, plain)
             return f"{role}.{KIND}={value}"
         if name == role and plain not in choices(role) and plain in announced(role):

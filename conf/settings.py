@@ -1,4 +1,4 @@
-"""`python -m conf.settings` writes docs/settings.md: every setting, as its declaration says."""
+"""`python -m conf.settings` writes docs/settings.md from the declarations of all settings."""
 
 from collections.abc import Iterator
 from dataclasses import Field
@@ -20,17 +20,17 @@ INTRODUCTION = """\
 # Settings
 
 Written by `python -m conf.settings` from the declarations in the code; a test checks that it is up
-to date. A setting is given as `name=value`, a preset of a group as `group=preset`. `null` is no
-value, and `???` stands where one must be given. A value that could have no effect beside the others
-is refused.
+to date. Give a setting as `name=value`, a preset of a group as `group=preset`. `null` means no
+value; `???` means that a value must be given. A value that has no effect with the other settings is
+refused.
 
-Presets of your own lie in a folder, `my_presets/tokens/mine.yaml`, and say only what differs from
-the defaults: `tangram-train --config-dir my_presets tokens=mine`."""
+Put presets of your own into a folder, as in `my_presets/tokens/mine.yaml`. They set only what
+differs from the defaults. Use them with `tangram-train --config-dir my_presets tokens=mine`."""
 
 
 def page() -> str:
     """The text of docs/settings.md."""
-    parts, told = [INTRODUCTION], dict[str, str]()  # row -> the command that has it first
+    parts, told = [INTRODUCTION], dict[str, str]()  # row -> first command with this row
     for command in COMMANDS.values():
         rows = [_row(own, own.name, command.defaults()[own.name]) for own in command.fields()]
         groups = ", ".join(command.groups)
@@ -59,20 +59,20 @@ def page() -> str:
 
 
 def _as_above(rows: list[str], told: dict[str, str]) -> Iterator[str]:
-    """Which settings a command shares with those before it."""
+    """Lines with the settings that a command shares with earlier commands."""
     for first in dict.fromkeys(told.values()):
         names = [row.split("|")[1].strip() for row in rows if told.get(row) == first]
         if names:
-            yield f"As `{first}`: {', '.join(names)}."
+            yield f"As for `{first}`: {', '.join(names)}."
 
 
 def _laid_over(command: Command) -> Iterator[str]:
-    """Which settings of a run a command may set."""
+    """A line with the settings of a run that a command can replace."""
     if command.over:
         names = ", ".join(f"`{name}`" for group in command.over for name in playable(group))
         yield (
-            "In place of what the run was trained with, as in `agent.reapply=1`: "
-            f"{names}. The others of {', '.join(command.over)} are refused."
+            "These settings can replace those of the run, as in `agent.reapply=1`: "
+            f"{names}. Other settings of {', '.join(command.over)} are refused."
         )
 
 
@@ -81,17 +81,17 @@ def _own(group: str, kinds: Kinds) -> list["Field[Any]"]:
 
 
 def _of_kind(group: str, kinds: Kinds, shared: set[str]) -> Iterator[str]:
-    """Whose settings follow, where a group has several kinds."""
+    """The heading of a kind's settings, if the group has several kinds."""
     kind = kinds.named().get(group)
     if kind is not None and _own(group, kinds):
         names = sorted(row.split("|")[1].strip() for row in shared)
-        yield f"Of `{group}.kind={kind}`" + (
-            f", and, as above, {', '.join(names)}:" if names else ":"
+        yield f"For `{group}.kind={kind}`" + (
+            f", besides {', '.join(names)} as above:" if names else ":"
         )
 
 
 def _table(rows: list[str]) -> str:
-    return "\n".join(["| setting | default | values | what it is |", "|---|---|---|---|", *rows])
+    return "\n".join(["| setting | default | values | meaning |", "|---|---|---|---|", *rows])
 
 
 def _row(own: "Field[Any]", name: str, default: Any) -> str:
@@ -123,7 +123,7 @@ def _only(what: Declaration, name: str) -> str:
 
 
 def _condition(word: str, other: str, values: tuple[object, ...]) -> str:
-    if values == (None,):  # with no value is without it
+    if values == (None,):  # with no value: the other setting is not given
         return f"{'not' if word == 'only with' else 'only'} with {other}"
     return f"{word} {other}={' or '.join(map(told, values))}"
 

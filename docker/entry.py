@@ -1,8 +1,8 @@
-"""A command in a container that docker starts again when it fails, unless its settings are wrong.
+"""Runs a command in a container; docker restarts it after a failure, but not for wrong settings.
 
     entry.py COMMAND [SETTING...]
 
-`restart: on-failure` knows one status that ends a container for good, 0.
+With `restart: on-failure` only exit status 0 ends a container for good.
 """
 
 import sys
@@ -12,11 +12,11 @@ from tangram_core.errors import USAGE_STATUS
 
 
 def main() -> int:
-    """The command's exit status; 0 for wrong input."""
+    """Run the command and return its exit status, but 0 for wrong input."""
     status = COMMANDS[sys.argv.pop(1)]()
     if status != USAGE_STATUS:
         return status
-    sys.stderr.write("not started again: change the settings, and give docker-compose up again\n")
+    sys.stderr.write("not restarted: correct the settings, then run docker-compose up again\n")
     return 0
 
 

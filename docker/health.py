@@ -1,9 +1,9 @@
-"""Health of a container: the master answers, or the worker's master can be reached.
+"""Health check of a container: the master answers, or the worker can reach its master.
 
     health.py master|worker [CONNECTION_FILE]
 
-A worker that makes no progress ends itself, so all that remains to ask is whether its master is
-there. Only the standard library is loaded: this runs every few seconds.
+A worker that makes no progress ends itself, so only the connection to its master is checked. Only
+the standard library is imported, because this runs every few seconds.
 """
 
 import json
@@ -18,7 +18,7 @@ TIMEOUT_S = 4.0
 
 
 def main() -> str | None:
-    """What is wrong, or nothing."""
+    """The problem in words; None if the container is healthy."""
     role = sys.argv[1]
     files = [Path(name) for name in sys.argv[2:]] or list(RUNS.glob("*/connection.json"))
     if not files:
@@ -36,7 +36,7 @@ def main() -> str | None:
                     end.connect(place.path)
             else:
                 socket.create_connection((place.hostname, place.port), TIMEOUT_S).close()
-    except OSError as error:  # of urllib, too: 503 is one
+    except OSError as error:  # also what urllib raises for HTTP errors such as 503
         return str(error)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         return f"no connection file of a run ({error!r})"

@@ -1,9 +1,9 @@
-"""The checkpointer: batches are on disk before they are acknowledged, the whole run at times.
+"""The checkpointer: journals each batch before it is acknowledged, and saves the run at intervals.
 
-A run goes on from its newest checkpoint that is whole, and from what the journal holds since.
+A resumed run starts from its newest intact checkpoint and replays the journal written since then.
 
-A disk that takes nothing more ends no run: nothing is acknowledged until there is room again, so
-the workers keep what they played, and wait.
+A full disk does not end the run. Batches are not acknowledged until there is space again, so the
+workers keep their episodes and wait.
 """
 
 import logging
@@ -38,11 +38,11 @@ from tangram_core.store.checkpoints import (
 )
 
 MINUTE_S = 60.0
-# Times what a checkpoint took, so that a slow disk leaves nine tenths to the learner; at most an
-# hour, since the process may have been stopped meanwhile.
+# The pause after a checkpoint is nine times its duration: on a slow disk the learner still gets
+# nine tenths of the time. At most an hour, because a stopped process makes the duration too long.
 BETWEEN, MOST_BETWEEN_S = 9.0, 3600.0
 RETRY_S = 1.0
-KEPT = 2  # newest checkpoints: the one before, if the newest is damaged
+KEPT = 2  # newest checkpoints: the second is used if the newest is damaged
 WAIT = "until then nothing is acknowledged, and workers keep what they played"
 MAKE_ROOM = f"make room there; {WAIT}"
 PUT_BACK = f"put it back, or make an empty folder there; {WAIT}"
@@ -53,11 +53,11 @@ log = logging.getLogger(__name__)
 
 
 class Checkpointer:
-    """Journals batches, and writes checkpoints when they are due, of nothing that is not finite.
+    """Journals batches, and writes a checkpoint when it is due and all values are finite.
 
     Attributes:
-        failing: the disk takes nothing more.
-        homeless: because the run folder is gone, or another one.
+        failing: whether the last write to the disk failed.
+        homeless: whether it failed because the run folder is gone or was replaced by another one.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Checkpointer:
         return True
 
     def tick(self) -> None:
-        """Sync the journal and write a checkpoint when it is time; a full disk is told."""
+        """Sync the journal and write a checkpoint if they are due; log a warning on a failure."""
         try:
             self._journal.tick()
             if self._look.due():
@@ -111,12 +111,12 @@ class Checkpointer:
             self._failed(error)
 
     def save(self) -> Path:
-        """Write a checkpoint, and drop the segments of the journal that nobody needs any more.
+        """Write a checkpoint, delete unneeded journal segments; returns the checkpoint's path.
 
         Raises:
-            RunError: the weights are not finite, one time too many.
+            RunError: the weights were not finite too many times in a row.
             FolderError: the run folder is gone.
-            JournalError, DiskError: the disk does not take it; what was there before is as it was.
+            JournalError, DiskError: the disk cannot be written; earlier files are unchanged.
         """
         self._guard.check()
         self._claim.check()
@@ -128,7 +128,7 @@ class Checkpointer:
         return self._newest
 
     def _keep_safe(self) -> None:
-        """Write a checkpoint at once where what was acknowledged is not on the disk any more."""
+        """Write a checkpoint at once if acknowledged data is no longer on the disk."""
         journal, known = self._journal, self._journal.exposed
         gone = "was made anew" if self._claim.check() else ""
         self.homeless = False
@@ -144,7 +144,7 @@ class Checkpointer:
             self.save()
             try:
                 self._claim.run.write_again()
-            except RunError as error:  # who joins later misses it, nobody else
+            except RunError as error:  # only workers that join later need these files
                 log.warning("%s", error)
 
     def _failed(self, error: RunError) -> None:
@@ -161,12 +161,12 @@ class Checkpointer:
 
 @dataclass(frozen=True)
 class Restored:
-    """What a checkpoint holds besides the trainer's state.
+    """Contents of a checkpoint besides the trainer's state.
 
     Attributes:
-        record: what the run had been through.
-        hub: the hub's table of what was inserted, so that nothing is inserted twice.
-        place: in the journal, None where it is not known.
+        record: counters of the run, such as its time and its newest scores.
+        hub: the hub's table of inserted batches, so that no batch is inserted twice.
+        place: position in the journal; None if unknown.
     """
 
     record: Record
@@ -175,16 +175,16 @@ class Restored:
 
     @staticmethod
     def of(counters: Mapping[str, Any]) -> "Restored":
-        """From the counters of a checkpoint; RunError if its record is not whole."""
+        """Read the counters of a checkpoint; RunError if the run's record is incomplete."""
         record = Record.of(counters["record"])
         return Restored(record, dict(counters["hub"]), _place(counters))
 
 
 def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
-    """Write a checkpoint from which `restore_run` goes on; the newest `keep` stay.
+    """Write a checkpoint for `restore_run`, keep only the newest `keep`; returns its path.
 
     Raises:
-        DiskError: the folder cannot be written; what was there before is as it was.
+        DiskError: the folder cannot be written; earlier checkpoints are unchanged.
     """
     arrays, counters = trainer.state()
     counters |= {"record": rest.record.state(), "hub": dict(rest.hub)}
@@ -194,7 +194,7 @@ def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
 
 
 def _place(counters: Mapping[str, Any]) -> Place | None:
-    """A checkpoint's place in the journal; RunError if it is none."""
+    """A checkpoint's position in the journal, None if it has none; RunError if it is invalid."""
     found = counters.get(JOURNAL)
     if found is None:
         return None
@@ -202,30 +202,31 @@ def _place(counters: Mapping[str, Any]) -> Place | None:
         return msgspec.convert({"segment": found} if isinstance(found, int) else found, Place)
     except msgspec.ValidationError as error:
         raise RunError(
-            f"its place in the journal cannot be read ({error}): delete it to use the one before"
+            f"its position in the journal cannot be read ({error}): delete the checkpoint to use "
+            "the one before"
         ) from None
 
 
 def first_needed(folder: Path) -> int:
-    """The first segment of the journal that one of the checkpoints may be continued with."""
+    """The number of the first journal segment that any checkpoint still needs."""
     needed = []
     for path in list_checkpoints(folder):
         try:
             place = _place(load_checkpoint(path, stems=[]).counters)
         except RunError:
-            continue  # it cannot be gone on from
+            continue  # a run cannot be resumed from it
         needed.append((place or Place()).segment)
     return min(needed, default=1)
 
 
 def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
-    """Take over the newest checkpoint that is whole; corrupt ones are renamed, with a warning.
+    """Load the newest intact checkpoint into the trainer; rename corrupt ones, with a warning.
 
     Returns:
-        What it holds besides the trainer's state, None where there was never a checkpoint.
+        The rest of the checkpoint; None if the run has never had a checkpoint.
 
     Raises:
-        RunError: the checkpoint is of another format, task or network, or none is whole.
+        RunError: the checkpoint has another format, task or network, or no checkpoint is intact.
     """
     found = _newest_whole(folder)
     if found is None:
@@ -237,7 +238,7 @@ def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
         raise RunError(f"cannot go on from {found.path}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise RunError(
-            f"cannot go on from {found.path}: its content is not that of a run "
+            f"cannot go on from {found.path}: it is not the checkpoint of a run "
             f"({type(error).__name__}: {error}); start a new run with another run_dir"
         ) from error
 
@@ -245,11 +246,11 @@ def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
 def warm_start(run_dir: Path, trainer: Trainer) -> None:
     """Give the trainer the networks of another run, with fresh optimisers and an empty replay.
 
-    The other run may have had another task, where its networks are of the same shapes; what an
-    agent learned of its world it may learn anew.
+    The other run may have another task if its networks have the same shapes. An agent may discard
+    what it learned about the other world besides the networks.
 
     Raises:
-        RunError: there is no whole checkpoint, or its networks have other shapes.
+        RunError: there is no intact checkpoint, or its networks have other shapes.
     """
     try:
         content = load_checkpoint(newest_checkpoint(run_dir / CHECKPOINTS), [LEARNER])
@@ -266,14 +267,14 @@ def _newest_whole(folder: Path) -> Checkpoint | None:
         except CorruptError as error:
             aside = set_aside(path)
             log.warning(
-                "checkpoint %s is corrupt (%s): it is %s now, and the one before is taken",
+                "checkpoint %s is corrupt (%s): it was renamed to %s, and the one before is used",
                 path,
                 error.why,
                 aside.name,
             )
     if was_set_aside(folder):
         raise RunError(
-            f"no checkpoint in {folder} is whole: put one from a backup there, or start a new run "
+            f"no checkpoint in {folder} is intact: put one from a backup there, or start a new run "
             "with another run_dir"
         )
     return None

@@ -17,29 +17,30 @@ from master.forking import Body, run_command, start
 from tangram_core.errors import UNAVAILABLE_STATUS, USAGE_STATUS
 from tangram_core.run.process import Lifeline
 
-# A process that lived for so long starts with a clean record.
+# After a life of this length, earlier restarts are not counted.
 STEADY_S = 60.0
 MAX_RESTARTS = 5
 FIRST_DELAY_S = 0.5
 MAX_DELAY_S = 30.0
-MAX_WAIT_S = 300.0  # for what the environment lacks, however often
-HUNG_STATUS = 1  # of a watchdog, though others use it, too
+MAX_WAIT_S = 300.0  # for something that the environment lacks; these restarts have no limit
+HUNG_STATUS = 1  # exit status of a watchdog; other failures have it, too
 TAIL_LINES = 12
 
 
 @dataclass(eq=False)
 class Child:
-    """One process, or several one after another in the same place.
+    """A child process and its restarts.
 
     Attributes:
-        arguments: the name of a command, and its own.
-        log: file that its output is appended to, None for the terminal.
-        nice: added to its niceness.
-        patience_s: without progress before its watchdog ends it, 0 for none.
-        restarts: in a row, without a steady time between.
-        wait_s: until the next start, where the environment lacks something, else 0.
-        next_start_s: monotonic time of the next start, None while nothing is planned.
-        body: what runs in the process with the arguments.
+        name: of the child, for log lines.
+        arguments: the name of a command, then the command's arguments.
+        log: file to which the output is appended; None for the terminal.
+        nice: added to the niceness of the process.
+        patience_s: seconds without progress after which the watchdog ends the process; 0 for none.
+        restarts: number of restarts in a row without `STEADY_S` between them.
+        wait_s: seconds until the next start if the environment lacks something, else 0.
+        next_start_s: monotonic time of the next start; None while no start is planned.
+        body: function that the process calls with the arguments.
     """
 
     name: str
@@ -59,19 +60,19 @@ class Child:
 
     @property
     def alive(self) -> bool:
-        """Whether a process runs here."""
+        """Whether the process is running."""
         return self._handle is not None and not _has_ended(self._handle, wait=False)
 
     @property
     def kept(self) -> bool:
-        """Whether a process is here, if only its end that nobody cleared, or is planned."""
+        """Whether there is a process (running, or ended and not cleared) or a planned start."""
         return self._process is not None or self.next_start_s is not None
 
     def start(self, ended: Callable[["Child"], None]) -> None:
-        """Start a process; `ended` is called with this, in another thread, when it ends.
+        """Start a process; when it ends, call `ended` with this child, in another thread.
 
         Raises:
-            TangramError: no process can be started; UnavailableError where one may be later.
+            TangramError: no process can be started; UnavailableError if a later start may succeed.
         """
         self.next_start_s, self._started_s, self._frozen_s = None, time.monotonic(), 0.0
         self._lifeline = Lifeline()
@@ -84,7 +85,7 @@ class Child:
         Thread(target=self._wait, args=(os.dup(self._handle), ended), daemon=True).start()
 
     def clear(self) -> int:
-        """Forget a process that has ended; returns its exit status, 0 where there is none."""
+        """Forget a process that has ended; returns its exit status, 0 if there was no process."""
         status = 0
         if self._lifeline is not None:
             self._lifeline.cut()
@@ -99,11 +100,11 @@ class Child:
     def plan_restart(self, status: int) -> bool:
         """Plan the next start with a growing delay; False to give up.
 
-        Status 2 is wrong input, which does not mend itself. What 75 tells of may take an hour, and
-        is no failure of the process.
+        Status 2 means wrong input, so another start would fail, too. Status 75 means that
+        something outside the process is missing, perhaps for an hour: retry without a limit.
         """
         now_s = time.monotonic()
-        # One that hung from its beginning lived for as long as its watchdog let it.
+        # A process that hung from the start still lives until its watchdog ends it.
         hung = status == HUNG_STATUS or self._frozen_s > 0.0
         if now_s - self._started_s >= STEADY_S + (self.patience_s if hung else 0.0):
             self.restarts, self.wait_s = 0, 0.0
@@ -125,18 +126,18 @@ class Child:
         return f"in {self.wait_s:g} s" if self.wait_s else f"{self.restarts} of {MAX_RESTARTS}"
 
     def tell(self, line: str) -> bool:
-        """Send a line to the process; False where it cannot take it."""
+        """Send a line of text to the process; False if it cannot receive the line."""
         return self._lifeline is not None and self._lifeline.tell(line)
 
     def kill_frozen(self, passed_s: float) -> bool:
-        """Kill a process that has been stopped (SIGSTOP) for too long: so has its watchdog.
+        """Kill a process that SIGSTOP has stopped for too long; its watchdog is stopped, too.
 
         Args:
-            passed_s: since this was called last; time in which the caller was stopped, as with a
-                whole job, does not count.
+            passed_s: seconds since the last call. Leave out the time in which the caller itself was
+                stopped, as when a whole job is stopped.
 
         Returns:
-            Whether it was killed.
+            Whether the process was killed.
         """
         frozen = self._process is not None and _is_stopped(self._process.pid or 0)
         self._frozen_s = self._frozen_s + passed_s if frozen else 0.0
@@ -152,7 +153,7 @@ class Child:
                 os.kill(self._process.pid or 0, number)
 
     def tail(self, count: int = TAIL_LINES) -> str:
-        """The last lines of its log."""
+        """The last lines of the log; empty if there is none."""
         if self.log is None or not self.log.exists():
             return ""
         lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -165,9 +166,9 @@ class Child:
 
 
 def _handle(process: ForkServerProcess) -> int:
-    """A file that can be read once the process has ended.
+    """A file descriptor that becomes readable when the process has ended.
 
-    Where the kernel has none (before 5.3), one of its server, whose end looks the same.
+    Before Linux 5.3 there is no pidfd; a pipe of the fork server then behaves the same way.
     """
     try:
         return os.pidfd_open(process.pid or 0)
@@ -182,7 +183,7 @@ def _has_ended(handle: int, *, wait: bool) -> bool:
 
 
 def _is_stopped(pid: int) -> bool:
-    """Whether there is such a process, and a signal has stopped it."""
+    """Whether the process exists and a signal has stopped it."""
     try:
         return psutil.Process(pid).status() == psutil.STATUS_STOPPED
     except psutil.Error:

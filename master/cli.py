@@ -1,6 +1,6 @@
 """The commands tangram-train, tangram-master and tangram-keys.
 
-Everything heavy is imported after the config was composed, so --help and wrong input are instant.
+Slow imports come after the config is composed, so --help and error messages appear at once.
 """
 
 import os
@@ -26,12 +26,12 @@ def train() -> int:
 
 
 def master() -> int:
-    """tangram-master: the one process that learns."""
+    """tangram-master: the process that learns."""
     return entry("master", _master)
 
 
 def keys() -> int:
-    """tangram-keys: who else may take part."""
+    """tangram-keys: add, revoke or list keys of a run."""
     return entry("keys", _keys)
 
 
@@ -49,7 +49,7 @@ def _keys(settings: Plain) -> int:
 
 def _train(settings: Plain) -> int:
     _make_absolute(settings)
-    # The children check it again; a wrong task is refused before any of them starts.
+    # The children check the config again; here a wrong task is refused before any of them starts.
     config, _ = _checked(settings, plays=True)
     tell(f"starts in {config.run_dir}")
 
@@ -74,7 +74,7 @@ def _master(settings: Plain) -> int:
 
 
 def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
-    """See `_made`; what goes wrong in code of the user's own is one line."""
+    """Call `_made`; an error in the user's own code becomes one line."""
     try:
         return _made(settings, plays=plays)
     except TangramError:
@@ -87,10 +87,10 @@ def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
 
 
 def _made(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
-    """What is to be trained; code of the user's own is written into the settings by its content.
+    """Build and check the config and the setup; add a digest of the user's code to the settings.
 
     Raises:
-        ConfigError: it cannot be trained.
+        ConfigError: training is not possible with these settings.
     """
     from master.config import MasterConfig, check_compiling
     from tangram_core.setup import from_mapping, make_setup
@@ -107,7 +107,7 @@ def _made(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
     check_batch_size(setup.spec)
     check_compiling(config.service)
     for name, section in setup.sections.items():
-        if section is not None and section != given[name]:  # it names code by its content now
+        if section is not None and section != given[name]:  # it has a digest of the code now
             settings[name] = settings[name] | vars(section)
     for role, kind in setup.kinds.items():
         settings[role] = settings[role] | kind
@@ -116,10 +116,10 @@ def _made(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
 
 
 def _hold_own_code(setup: "Setup") -> None:
-    """Play and learn a little with a task or an agent of the user's own, before anything starts.
+    """Test a user's own task or agent with a short game and a few updates, before anything starts.
 
     Raises:
-        ConformanceError: a promise of its interface is not kept.
+        ConformanceError: the task or agent breaks a rule of its interface.
     """
     own = [role for role, kind in setup.kinds.items() if SHA256 in kind]
     if not own or VARIABLE in os.environ:  # the launcher did it
@@ -134,7 +134,7 @@ def _hold_own_code(setup: "Setup") -> None:
 
 
 def _make_absolute(settings: Plain) -> None:
-    """Folders as seen from where the command was started; what is no text is left alone."""
+    """Make the paths of folders absolute; values that are not strings stay as they are."""
     for name in ("run_dir", "warm_start"):
         value = settings.get(name)
         if isinstance(value, str) and value.strip():

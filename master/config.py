@@ -1,4 +1,4 @@
-"""Settings of a run: of its master, and of a whole training on one machine."""
+"""Settings of tangram-train, tangram-master and tangram-keys."""
 
 import os
 import shutil
@@ -15,14 +15,16 @@ COMPILERS = ("g++", "clang++")
 
 @dataclass(frozen=True)
 class KeysConfig(Settings):
-    """Who else may take part in a run (tangram-keys)."""
+    """Settings of tangram-keys."""
 
     run_dir: str = field(metadata=declared("folder of the run"))
-    add: str | None = setting(None, "make a key for somebody of this name", only={"revoke": None})
-    revoke: str | None = setting(None, "take the key of this name back")
-    role: str = setting("player", "that a new key is for", choices=ROLES, unless={"add": None})
+    add: str | None = setting(
+        None, "name of the person or machine that gets a new key", only={"revoke": None}
+    )
+    revoke: str | None = setting(None, "name of the key to revoke")
+    role: str = setting("player", "role of the new key", choices=ROLES, unless={"add": None})
     out: str | None = setting(
-        None, "connection file with a new key alone; NAME.json if not given", unless={"add": None}
+        None, "connection file to write with the new key; default NAME.json", unless={"add": None}
     )
 
     def __post_init__(self) -> None:
@@ -31,7 +33,7 @@ class KeysConfig(Settings):
 
 
 def check_compiling(service: ServiceConfig) -> None:
-    """Raise ConfigError, which says what is missing, where updates cannot be compiled."""
+    """Raise ConfigError if updates are to be compiled and there is no compiler."""
     if not service.compile:
         return
     named = os.environ.get("CXX")
@@ -44,23 +46,25 @@ def check_compiling(service: ServiceConfig) -> None:
 
 @dataclass(frozen=True)
 class MasterConfig(Settings):
-    """One run, of a master alone or with its workers on this machine."""
+    """Settings of one run, for tangram-train and tangram-master."""
 
     run_dir: str = field(metadata=declared("folder of the run, made if it is missing"))
-    seed: int = setting(0, "of everything random in the run", low=0, high=2**63 - 1)
-    max_hours: float = setting(0.0, "the run ends after this time, 0 for no bound", low=0, unit="h")
-    max_episodes: int = setting(0, "after this many episodes, 0 for no bound", low=0)
-    max_updates: int = setting(2000, "after this many updates, 0 for no bound", low=0)
+    seed: int = setting(0, "seed of everything random in the run", low=0, high=2**63 - 1)
+    max_hours: float = setting(0.0, "end the run after this time, 0 for no bound", low=0, unit="h")
+    max_episodes: int = setting(0, "end the run after this many episodes, 0 for no bound", low=0)
+    max_updates: int = setting(2000, "end the run after this many updates, 0 for no bound", low=0)
     resume: str = setting(
         "none",
-        "none: a folder that holds a run is refused; auto: go on from its newest valid checkpoint",
+        "none: refuse a folder that holds a run; auto: continue from its newest intact checkpoint",
         choices=("none", "auto"),
     )
-    warm_start: str | None = setting(None, "folder of a run whose networks this run begins with")
+    warm_start: str | None = setting(
+        None, "folder of a run; this run starts with the networks of that run"
+    )
     workers: int = setting(
         1,
-        "processes that play, one evaluator joins them; tangram-master starts none and, in "
-        "lockstep, waits for so many",
+        "number of players that tangram-train starts, besides one evaluator; tangram-master starts "
+        "none and, in lockstep, waits for this many",
         low=1,
         high=MAX_WORKERS,
     )
@@ -69,8 +73,8 @@ class MasterConfig(Settings):
     def __post_init__(self) -> None:
         if self.workers < 1:
             raise ConfigError(
-                f"workers must be at least 1, got {self.workers}: without one nothing is played; "
-                "tangram-master alone waits for workers from elsewhere"
+                f"workers must be at least 1, got {self.workers}: a run needs a player; for "
+                "workers on other machines only, start tangram-master"
             )
         super().__post_init__()
         check_folder("run_dir", self.run_dir)

@@ -1,7 +1,8 @@
-"""Processes that start at once: a server has imported torch for all of them, each is its fork.
+"""Child processes that start fast: forks of one server process that has already imported torch.
 
-Alone, a process takes seconds until it has imported all, and each has its own copy in memory. The
-server is that of `multiprocessing`. It ends with the process that started it and all children.
+A process without this server takes seconds for its imports and has its own copy of them in memory.
+The server is the fork server of `multiprocessing`. It ends after the process that started it and
+all children have ended.
 """
 
 import multiprocessing
@@ -23,16 +24,16 @@ from tangram_core.errors import TangramError, UnavailableError, is_passing
 from tangram_core.run.process import VARIABLE
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-SAFE_PATH = "PYTHONSAFEPATH"  # of the server, which must not find the modules of a user first
+SAFE_PATH = "PYTHONSAFEPATH"  # so that the server does not import a user's modules by mistake
 ROOT = Path(__file__).resolve().parent.parent
-# Runs in the process, with its arguments; found again there by its name.
+# The function that a process runs. It is pickled by name, so it must be at the top of a module.
 Body = Callable[[Sequence[str]], int]
 
 _context = multiprocessing.get_context("forkserver")
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run tangram-NAME of this installation: arguments are the name, and its own.
+    """Run the command tangram-NAME; arguments[0] is NAME, the rest are the command's arguments.
 
     Returns:
         The exit status.
@@ -44,34 +45,34 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def warm_up() -> None:
-    """Start the server, unless it runs, and wait until it can fork.
+    """Start the server if it is not running, and wait until it can fork.
 
-    It has this process's environment. Errors are those of `start`, which meets them again.
+    The server has the environment of this process. Errors are ignored here: `start` raises them.
     """
     with Path(os.devnull).open() as nothing, suppress(TangramError):
         start(run_nothing, ["nothing"], None, 0, nothing.fileno()).join()
 
 
 def run_nothing(_: Sequence[str]) -> int:
-    """End well."""
+    """Do nothing and return exit status 0."""
     return 0
 
 
 def start(
     body: Body, arguments: Sequence[str], log: Path | None, nice: int, read_end: int
 ) -> ForkServerProcess:
-    """Start a process in a session of its own.
+    """Start a process in a new session.
 
     Args:
-        body: what it runs.
-        arguments: of that, also its title, as `ps` shows it.
-        log: file that its output is appended to, None for the terminal.
-        nice: added to its niceness.
-        read_end: of its lifeline.
+        body: function that the process runs.
+        arguments: of the function; also the title of the process in `ps`.
+        log: file to which the output is appended; None for the terminal.
+        nice: added to the niceness of the process.
+        read_end: file descriptor of the child's end of its lifeline.
 
     Raises:
-        UnavailableError: the server was killed just now, or there is no room for a process.
-        TangramError: it cannot start.
+        UnavailableError: the server was just killed, or there is no memory for a process now.
+        TangramError: the process cannot start.
     """
     _context.set_forkserver_preload(["tangram_cli.forkserver"])
     with Connection(os.dup(read_end), writable=False) as lifeline:
@@ -90,13 +91,15 @@ def start(
 
 
 def _ensure_server() -> None:
-    """With our environment, and signals held back from its first moment on.
+    """Start the server with our environment and with signals blocked.
 
-    A whole job may get these: the server outlasts them, and its forks take what came meanwhile.
+    A scheduler may signal all processes of a job. The server must survive that. Its forks unblock
+    the signals and receive those that came in between.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
-        resource_tracker.ensure_running()  # the server's companion; it lets some signals in again
+        # It belongs to the server, and its start unblocks some signals: block them again.
+        resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         with _environment():
             forkserver.ensure_running()
@@ -107,12 +110,12 @@ def _ensure_server() -> None:
 def _become(
     body: Body, arguments: Sequence[str], log: Path | None, nice: int, lifeline: Connection
 ) -> None:
-    """In the child."""
-    # Ctrl-C reaches the whole terminal; the parent decides who ends when.
+    """Set up the child process, and run its body."""
+    # Ctrl-C goes to all processes of a session; here the parent decides when a child ends.
     os.setsid()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     os.nice(nice)
-    # As in a process of its own: what plug-ins may use, and what theirs inherit.
+    # As in a process that was not forked, for plug-ins and for the processes that they start.
     import_module("numpy").random.seed()
     multiprocessing.set_start_method(None, force=True)
     del os.environ[SAFE_PATH]
@@ -120,7 +123,7 @@ def _become(
     if log is not None:
         try:
             output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-        except OSError:  # where the disk takes no log: that is no reason to be without it
+        except OSError:  # the disk cannot be written: run without a log
             output = os.open(os.devnull, os.O_WRONLY)
         _redirect(output, 1, 2)
     os.environ[VARIABLE] = str(os.dup(lifeline.fileno()))
@@ -146,10 +149,10 @@ def _environment() -> Iterator[None]:
 
 
 def environment() -> dict[str, str]:
-    """One thread each, since several processes share the cores, and the same packages as here."""
+    """Environment of the children: one thread each, as they share the cores, and our packages."""
     variables = dict.fromkeys(THREADS, "1") | dict(os.environ)
     if (ROOT / "pyproject.toml").exists():  # a source tree, which need not be installed
         paths = [variables.get("PYTHONPATH", ""), str(ROOT)]
         variables["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
-    # SPT_NOENV: /proc tells the environment of children, for which their titles are cut.
+    # SPT_NOENV: keeps the environment readable in /proc; long titles are cut for that.
     return variables | {"PYTHONUNBUFFERED": "1", SAFE_PATH: "1", "SPT_NOENV": "1"}

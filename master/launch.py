@@ -1,4 +1,4 @@
-"""tangram-train: a master, its workers and an evaluator on this machine, and no orphan of them."""
+"""tangram-train: starts a master, its workers and an evaluator here; leaves no orphan process."""
 
 import logging
 import signal
@@ -25,37 +25,37 @@ from tangram_core.run.outcome import CTRL_C
 from tangram_core.run.process import WATCHDOG_S, Every, handling, watch_parent
 from tangram_core.wire.messages import TAKEN_OVER
 
-# While the master starts, its connection file is looked for this often.
+# Seconds between two looks for the connection file while the master starts.
 LOOK_S = 0.1
 IDLE_S = 1.0
-# The master writes its checkpoint and its result meanwhile.
+# After a signal the master has this time to write its checkpoint and its result.
 STOP_S = 120.0
 LEAVE_S = 8.0
 FAILED_STATUS = 1
 TAKE_BACK_S = 30.0
 PLAYER_NICE = 5
 EVALUATOR_NICE = 10
-GO_ON = "the same command with resume=auto goes on from what it kept"
+GO_ON = "the same command with resume=auto goes on from what was saved"
 
 log = logging.getLogger(__name__)
 
 
 def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
-    """Train until the master is done, and leave no process behind.
+    """Train until the master ends, and end all child processes.
 
     Args:
         config: the settings of the run.
         resolved: the whole config as plain values, for config.yaml, which the children read.
 
     Returns:
-        The master's exit status; 1 when no worker can be kept alive.
+        The master's exit status; 1 if all workers failed for good.
 
     Raises:
         TangramError: the run folder cannot be used.
     """
     folder = RunFolder(config.run_dir)
     folder.prepare(config.resume)
-    # To the end: else another training could write its settings before the master has its lock.
+    # Held to the end: another training must not write its settings before the master has its lock.
     with folder.lock(LAUNCHER):
         with folder.lock():
             check_resumable(folder, resolved)
@@ -64,7 +64,7 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
             if not finished:
                 folder.logs.mkdir(exist_ok=True)
                 folder.write_config(resolved)
-                # Left by a master that was killed; workers must wait for the new one.
+                # A killed master leaves its file; workers must wait for the file of the new master.
                 folder.connection.unlink(missing_ok=True)
         return _launched(config, resolved, folder, finished)
 
@@ -79,7 +79,7 @@ def _launched(
         if finished:
             show_finished(folder, form, code)
             return 0
-        watch_parent(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
+        watch_parent(grace_s=STOP_S + 2.0 * LEAVE_S)  # if an experiment started this process
         try:
             return launcher.run()
         finally:
@@ -102,14 +102,14 @@ class Launcher:
         self._stop_s: float | None = None
         self._signalled_s: float | None = None
         self._failed, self._sent_home = False, False
-        self._reached = False  # this life of the master can be reached, or could
+        self._reached = False  # since its last start, the master has been reachable at some time
 
     def signals(self) -> AbstractContextManager[None]:
-        """Turn signals into events."""
+        """A context in which signals become events of `run`."""
         return handling(self._events.put, SIGNALS)
 
     def run(self) -> int:
-        """Run until the master has ended; returns the exit status for the user."""
+        """Run until the master has ended; returns the exit status of tangram-train."""
         number = self._warm_up()
         if number is not None:
             return 128 + number
@@ -118,7 +118,7 @@ class Launcher:
             self._kill_frozen()
             event = self._next_event()
             if isinstance(event, signal.Signals):
-                if self._master.next_start_s is not None:  # nothing runs that has to be saved
+                if self._master.next_start_s is not None:  # no master is running: nothing to save
                     self._say(f"{CTRL_C.get(event.name, event.name)}: the run ends; {GO_ON}")
                     return 128 + event
                 self._signalled(event)
@@ -132,10 +132,10 @@ class Launcher:
                     return FAILED_STATUS
             elif self._stop_s is not None and time.monotonic() >= self._stop_s:
                 self._kill_all()
-                log.info("the master does not end within %g s: it is killed", STOP_S)
+                log.info("the master did not end within %g s and was killed", STOP_S)
 
     def end_all(self) -> None:
-        """Wait for the children to end, then ask them to, then kill them; a signal hurries it."""
+        """Wait for the children to end, then send SIGTERM, then SIGKILL; a signal ends a wait."""
         steps = [signal.SIGTERM, signal.SIGKILL]
         children = [*self._workers, self._master]
         if self._sent_home:
@@ -152,17 +152,17 @@ class Launcher:
         return [*self._players, self._evaluator]
 
     def _warm_up(self) -> signal.Signals | None:
-        """Wait until processes can be started; returns the signal that came meanwhile."""
+        """Wait until processes can be started; returns a signal that came during the wait."""
         starting = Thread(target=warm_up, daemon=True)
         starting.start()
-        while starting.is_alive():  # it takes seconds, minutes from a slow disk
+        while starting.is_alive():  # this takes seconds, from a slow disk minutes
             event = self._next_event()
             if isinstance(event, signal.Signals):
                 return event
         return None
 
     def _start_due(self) -> None:
-        """Start the workers once the master can be reached, and again whose delay is over."""
+        """Start each child whose time has come; workers only while the master is reachable."""
         if self._stop_s is not None:
             return
         reachable = self._folder.connection.exists()
@@ -182,7 +182,7 @@ class Launcher:
         for child in (self._master, *self._workers):
             if child.kill_frozen(IDLE_S):
                 tell = log.info if child is self._master else self._say
-                tell(f"{child.name} has been stopped for {child.patience_s:g} s: it is killed")
+                tell(f"{child.name} was stopped for {child.patience_s:g} s and was killed")
 
     def _next_event(self) -> Child | signal.Signals | None:
         children = [self._master, *self._workers]
@@ -212,30 +212,30 @@ class Launcher:
     def _stop(self, why: str, number: signal.Signals = signal.SIGTERM) -> None:
         self._say(why)
         self._stop_s = time.monotonic() + STOP_S
-        self._master.signal(number)  # the same, so that its result names what ended the run
+        self._master.signal(number)  # the same signal, because the result names it
 
     def _master_comes_back(self, status: int) -> bool:
-        """Plan to go on from what a master left that was killed, or hung; workers wait for it."""
+        """Plan a restart of a master that was killed or hung, with resume=auto; False if not."""
         if status == 0 or self._stop_s is not None or not self._master.plan_restart(status):
             return False
-        # A worker that is started meanwhile must not look for the one that is gone.
-        with suppress(OSError):  # a disk that failed
+        # A worker that starts now must not connect to the address of the dead master.
+        with suppress(OSError):  # the disk failed
             self._folder.connection.unlink(missing_ok=True)
         self._reached = False
         self._master.arguments = [
             "resume=auto" if text.startswith("resume=") else text for text in self._master.arguments
         ]
         log.info(
-            "the master ended with %s: it goes on from what it left (%s)",
+            "the master ended with %s: it is started again with resume=auto (%s)",
             describe(status),
             self._master.plan,
         )
         return True
 
     def _master_ended(self, status: int) -> int:
-        # A master that ends in order has told its workers.
+        # With status 0 the master has told its workers to end.
         self._sent_home = status == 0
-        if status not in (0, USAGE_STATUS):  # with 2 it has told what is wrong
+        if status not in (0, USAGE_STATUS):  # with USAGE_STATUS it has shown an error message
             self._say(f"the master ended with {describe(status)}; {GO_ON}")
         if self._failed:
             return FAILED_STATUS
@@ -244,7 +244,7 @@ class Launcher:
     def _worker_ended(self, child: Child) -> None:
         status = child.clear()
         if self._reached and not self._folder.connection.exists():
-            child.next_start_s = 0.0  # the master took leave of it; for one that comes back
+            child.next_start_s = 0.0  # the master dismissed it: start again if the master returns
             return
         if self._stop_s is not None:
             return
@@ -257,23 +257,29 @@ class Launcher:
                 f"see {child.log}{lacks}"
             )
         else:
-            self._say(f"{child.name} ended with {describe(status)}: given up\n{child.tail()}")
+            self._say(
+                f"{child.name} ended with {describe(status)}: it is not started again\n"
+                f"{child.tail()}"
+            )
             if not any(player.kept for player in self._players):
                 self._failed = True
                 self._stop("no worker is left: the run ends")
 
     def _make_way(self, child: Child) -> None:
-        """Somebody started a worker with the index of one: that is no failure, and no contest."""
-        lost = f"{child.name} lost its index to a worker that was started with the same"
-        if self._in_step:  # whose rounds are of these indices
+        """Start a child again that lost its index to a worker which a user started by hand."""
+        lost = f"{child.name} lost its index to another worker that was started with this index"
+        if self._in_step:  # a round needs all of these indices
             child.next_start_s = time.monotonic() + TAKE_BACK_S
-            self._say(f"{lost}: it takes it back in {TAKE_BACK_S:g} s; start others without index=")
+            self._say(
+                f"{lost}: it takes the index back in {TAKE_BACK_S:g} s; start other workers "
+                "without index="
+            )
             return
         child.next_start_s = time.monotonic()
         child.arguments = [
             "index=-1" if text.startswith("index=") else text for text in child.arguments
         ]
-        self._say(f"{lost}: it goes on with one that is free")
+        self._say(f"{lost}: it continues with a free index")
 
     def _say(self, text: str) -> None:
         """Show a line through the master, which owns the terminal while it runs."""
@@ -289,15 +295,15 @@ class Launcher:
                 event = self._events.get(timeout=max(until_s - time.monotonic(), 0.0))
             except Empty:
                 return
-            # The signal that ended the run may come again at once, as from SLURM when it queues a
-            # job again: children that were just asked to leave need their time.
+            # The same signal may come twice, for example from SLURM when it requeues a job. The
+            # second one must not shorten the children's time to leave.
             hurried = time.monotonic() - began_s >= SAME_WISH_S
             if isinstance(event, signal.Signals) and hurried:
                 return
 
 
 def worker_child(folder: RunFolder, role: str, index: int) -> Child:
-    """A worker that joins by the run's connection file, with a log of its own."""
+    """A worker or evaluator that joins with the run's connection file and has its own log file."""
     name = role if role == "evaluator" else f"worker {index}"
     arguments = [
         "worker",
@@ -310,7 +316,7 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
 
 
 def master_arguments(config: MasterConfig, folder: RunFolder) -> list[str]:
-    """The command that starts the master."""
+    """Name and arguments of the command that starts the master."""
     in_step = config.service.mode == "lockstep"
     return [
         "master",

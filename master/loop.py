@@ -1,4 +1,4 @@
-"""The master: one process, one loop, from what workers played to the weights they play with."""
+"""The main loop of the master: receive episodes, train, publish weights, save."""
 
 import logging
 import time
@@ -20,11 +20,11 @@ from tangram_core.run.process import Every, Watchdog
 from tangram_core.run.service import ServiceConfig
 from tangram_core.wire.messages import RunStatus
 
-# Between two looks at the sockets: learning goes on for so long, inserting, or idleness lasts.
+# Longest time to learn, to insert or to be idle before the sockets are served again.
 LEARN_S = 0.05
 INSERT_S = 0.02
 IDLE_S = 0.05
-# At the end: for the scores of the final weights, the same after a signal, and for goodbyes.
+# At the end: longest wait for the final scores, for them after a signal, and for workers to leave.
 SCORES_S = 120.0
 SIGNALLED_SCORES_S = 8.0
 LEAVE_S = 5.0
@@ -34,10 +34,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class Loop:
-    """Takes in, learns, publishes and saves until a bound or a signal ends it.
+    """Receives episodes, trains, publishes weights and saves until a bound or a signal.
 
-    Its collaborators are open when it is made, and its folder's connection file goes away with it.
-    The watchdog ends the process where the loop hangs.
+    The arguments must be open already. The loop deletes the folder's connection file at its end.
+    The watchdog ends the process if the loop hangs.
     """
 
     service: ServiceConfig
@@ -60,7 +60,7 @@ class Loop:
         self._publish = Every(self.service.publish_seconds)
 
     def run(self) -> str:
-        """Learn until a bound or a signal ends it; returns which."""
+        """Learn until a bound or a signal ends the loop; returns the reason, as in `over`."""
         self.publish()
         more = False
         while (reason := self.over()) is None:
@@ -77,15 +77,15 @@ class Loop:
         return reason
 
     def over(self) -> str | None:
-        """Why the loop ends now, or None."""
+        """The bound or signal that ends the loop now, or None."""
         reason = self.signals.reason or self.budget.spent()
-        # The updates that the last episodes are worth come first.
+        # After the last episode, the updates that are still due come first.
         if reason is None and not self.budget.takes_episodes() and not self._limiter.may_update():
             return f"max_episodes={self.budget.max_episodes}"
         return reason
 
     def receive(self, patience_s: float) -> None:
-        """Take what has arrived, and answer the peers."""
+        """Receive batches and scores, and answer the peers; wait at most `patience_s`."""
         self.watchdog.progress()
         for arrival in self.hub.poll(patience_s):
             if isinstance(arrival, ScoresArrived):
@@ -96,12 +96,12 @@ class Loop:
         record.workers = max(record.workers, self.hub.count("player"))
 
     def insert(self) -> bool:
-        """Move batches into the replay while the learner keeps up; senders of others wait.
+        """Insert batches into the replay buffer while the learner keeps up; the others wait.
 
-        By turns of keys, so that each has an equal share of what is learned from.
+        The keys take turns, so that each key has an equal share of the inserted transitions.
 
         Returns:
-            Whether there may be more that could be inserted at once.
+            Whether more batches may be inserted at once.
         """
         until_s = time.monotonic() + INSERT_S
         while len(self._arrived) and self._limiter.may_insert() and self.budget.takes_episodes():
@@ -114,7 +114,7 @@ class Loop:
         return False
 
     def insert_round(self, lockstep: Lockstep) -> None:
-        """In lockstep: insert a round when it is whole, order the next when it is learned."""
+        """In lockstep: insert a round when it is complete; order the next after its updates."""
         while len(self._arrived):
             self._arrived.first()
             lockstep.take(self._arrived.serve(0.0))
@@ -131,69 +131,69 @@ class Loop:
             lockstep.inserted(arrival)
 
     def may_learn(self) -> bool:
-        """Whether an update is due, and in lockstep whether the round is whole."""
+        """Whether an update is due; in lockstep, also whether the round is complete."""
         lockstep = self.lockstep
         whole = lockstep is None or lockstep.begins_round(self._trainer.episodes)
         return whole and self._limiter.may_update()
 
     def learn(self) -> None:
-        """Updates that are due, for a short while, so that the sockets are served in between."""
+        """Make the updates that are due, for a short time, so that the sockets are served."""
         until_s = time.monotonic() + LEARN_S
         while self.may_learn() and time.monotonic() < until_s and self.budget.spent() is None:
             self.reporter.updated(self.guard.update(self.budget.share))
             self.publish_due()
 
     def publish_due(self) -> None:
-        """Send the weights where it is time; in lockstep they go with the orders."""
+        """Publish the weights if they are due; in lockstep `insert_round` does so instead."""
         if self.lockstep is None and self._publish.due():
             self.publish()
 
     def publish(self) -> None:
-        """Send the acting weights, unless these were sent before; RunError as in `weights`."""
+        """Broadcast the acting weights if they are new; RunError as in `guard.weights`."""
         if self._trainer.updates <= self._published:
             return
         weights = self.guard.weights()
         if weights.version <= self._published:
-            return  # the present ones were bad, and the last good ones are known
+            return  # the newest weights were not finite; the older ones were sent before
         self.hub.publish(weights)
         self._published = weights.version
         self.reporter.published(weights.version)
-        if self.service.publish_seconds > 0.0:  # else after every update, whatever it costs
+        if self.service.publish_seconds > 0.0:  # 0 means after every update, at any cost
             self._publish.rest(self.hub.broadcast_s)
 
     def finish(self, launched: bool) -> RunStatus:
-        """Send and keep the final weights, have them scored, draw the test episodes.
+        """Publish and save the final weights, wait for their scores, and draw the test episodes.
 
         Args:
-            launched: an evaluator is known to come, even if it has not joined yet.
+            launched: tangram-train started this process, so an evaluator will join.
 
         Returns:
-            How the run stands at its end.
+            The status of the run at its end.
 
         Raises:
             RunError: the disk is full.
         """
-        if self.signals.reason is not None and not launched:  # a launcher has said it
+        if self.signals.reason is not None and not launched:  # else tangram-train has shown it
             log.info(stop_notice(self.signals.reason))
         self.guard.check()
         self.publish()
-        # Before anything that takes time: what was learned is safe from here on.
+        # First of all, because the rest takes time.
         try:
             self.checkpointer.save()
         except FolderError as error:
             raise RunError(
-                f"{error}: the run ended without a checkpoint, and what it learned since the last "
-                "one is lost; a copy of the folder goes on from there with resume=auto"
+                f"{error}: the run ended without a checkpoint, and all since the last one is lost; "
+                "if you have a copy of the folder, go on from there with resume=auto"
             ) from None
         self._wait_for_scores(launched)
         self.reporter.draw()
         return self.reporter.flush(len(self._arrived))
 
     def dismiss(self, reason: str) -> None:
-        """Tell all peers to end, and wait a moment for them to leave."""
+        """Tell all peers to end, and wait up to `LEAVE_S` for them to leave."""
         self._dismissed = True
-        # First: it would bring new ones, and a launcher restarts who ends while it is there.
-        with suppress(OSError):  # the disk has failed
+        # First: while this file exists, new workers join and tangram-train restarts the old ones.
+        with suppress(OSError):  # the disk failed
             self.folder.connection.unlink()
         until_s = time.monotonic() + LEAVE_S
         self.hub.stop(reason)
@@ -201,18 +201,18 @@ class Loop:
             self.hub.poll(IDLE_S)
 
     def close(self) -> None:
-        """Tell all peers to end if that was not done: the master failed."""
+        """Dismiss all peers if that was not done, which means that the master failed."""
         if not self._dismissed:
             self.dismiss("the master failed")
 
     def _insert(self, arrival: EpisodesArrived) -> None:
         self._trainer.insert(arrival.episodes)
-        # Only now: a worker forgets what is acknowledged.
+        # Only now, because a worker deletes a batch that is acknowledged.
         self.hub.acknowledge(arrival)
         self.reporter.inserted(arrival)
 
     def _wait_for_scores(self, launched: bool) -> None:
-        """Wait a bounded time for scores, if there is an evaluator that can send them."""
+        """Wait for scores, for a limited time, if there is an evaluator or one may still join."""
         record, signalled = self.clock.record, self.signals.reason is not None
         limit_s = SIGNALLED_SCORES_S if signalled else SCORES_S + self.service.eval_seconds
         begun_s = time.monotonic()
@@ -220,7 +220,7 @@ class Loop:
         while record.scored_version != self._trainer.updates:
             waited_s = time.monotonic() - begun_s
             hurried = self.signals.reason is not None and not signalled
-            # One that was launched may still be loading: on a busy machine that takes a minute.
+            # An evaluator of tangram-train may still be loading: a minute on a busy machine.
             hopeless = (signalled or not launched) and not self.hub.count("evaluator")
             if waited_s >= limit_s or hurried or hopeless:
                 return

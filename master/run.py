@@ -1,4 +1,4 @@
-"""One run of the master: its collaborators are made or restored, then the loop begins."""
+"""One run of the master: create or restore all objects of the run, then start the loop."""
 
 import logging
 import secrets
@@ -43,7 +43,7 @@ from tangram_core.setup import Setup
 from tangram_core.wire.addresses import LOCAL, dns_error, reachable, with_host
 from tangram_core.wire.messages import OPEN, WINDOW
 
-# A clean end after the parent's death; a large replay takes seconds to write.
+# Time to end cleanly after the parent has died; a large replay buffer takes seconds to write.
 GRACE_S = 30.0
 UNBOUNDED = (
     "max_hours, max_episodes and max_updates are all 0: only Ctrl-C or SIGTERM ends this run, and "
@@ -54,7 +54,7 @@ log = logging.getLogger(__name__)
 
 
 def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) -> int:
-    """Learn until a bound is reached or a signal comes, and leave a finished run folder.
+    """Learn until a bound is reached or a signal comes, then write the result to the run folder.
 
     Args:
         config: the master's settings.
@@ -72,9 +72,9 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
     console = sturdy_console(sys.stdout)
     with ExitStack() as opened:
         opened.enter_context(logging_to(console, form))
-        # The launcher shares the terminal with this process: its lines are shown here.
+        # tangram-train shares the terminal with this process, so its lines are shown here.
         launched = watch_parent(partial(log.info, "%s", extra={"event": "launcher"}), GRACE_S)
-        Room.here()  # before anything is written
+        Room.here()  # may refuse the run: before any file is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
         claim = opened.enter_context(folder.lock())
@@ -82,7 +82,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         watchdog = opened.enter_context(Watchdog(WATCHDOG_S))
         code, evaluator = code_of(resolved), ""
         join = {"connect": folder.path, **code}
-        if not launched:  # the launcher did it, with settings of its own
+        if not launched:  # else tangram-train did this, with its own settings
             check_resumable(folder, resolved)
             listening_place(config.service.bind, folder.path)
             if folder.has_finished(config):
@@ -98,7 +98,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         folder.write_connection(connection)
         if not launched:
             log.info("workers join with: %s", command_line("tangram-worker", join))
-            log.info("an evaluator scores what is learned: %s", evaluator)
+            log.info("an evaluator, which scores the weights, joins with: %s", evaluator)
         reason = loop.run()
         facts, scores = loop.guard.trainer.facts(), setup.task.scores
         result = make_result(loop.finish(launched), scores, facts, config.seed, reason)
@@ -121,20 +121,20 @@ def open_run(
     watchdog: Watchdog,
     opened: ExitStack,
 ) -> tuple[Loop, dict[str, Any]]:
-    """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
+    """Create all objects of a run; with resume=auto, restore them from the newest checkpoint.
 
-    The watchdog hears of every batch of the journal, which may take long to read. What is opened
-    here is closed with `opened`.
+    The journal may take long to read; the watchdog gets a sign of progress for each batch. `opened`
+    closes the objects that are opened here.
 
     Returns:
-        The loop, and what a worker needs to find this master and to be let in.
+        The loop, and the connection data for workers, see `connection_of`.
 
     Raises:
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
     service, folder = config.service, claim.run
     trainer, found = _make_trainer(config, setup, folder, watchdog)
-    # A run that was killed before its first checkpoint has a journal.
+    # A run that was killed before its first checkpoint has only a journal.
     rest = found or Restored(Record(journal_run_id(folder.journal) or secrets.token_hex(8)), {})
     run_id = rest.record.run_id
     guard = DivergenceGuard(trainer, folder.bad_batch)
@@ -151,7 +151,7 @@ def open_run(
         health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
     if found is not None:
         hub.load_state(rest.hub)
-    # What was acknowledged after the checkpoint.
+    # Batches that were acknowledged after the checkpoint.
     digest, spec = setup.task_digest(), setup.spec
     batches = Reader(folder.journal, rest.place, run_id, digest, spec, log.warning)
     _insert_again(batches, hub, guard, budget, lockstep, watchdog)
@@ -190,11 +190,11 @@ def open_run(
 def connection_of(
     service: ServiceConfig, hub: Hub, run_id: str, http: str | None, keys: Keys | None
 ) -> dict[str, Any]:
-    """What a worker needs to find this master, and to be let in where there are keys."""
+    """Connection data for workers: addresses, run id, and the keys if the run has any."""
     host = service.host or socket.gethostname()
     announced = with_host if service.host else reachable
     if service.host and (unknown := dns_error(with_host(hub.endpoint, host))):
-        log.warning("service.host: %s here: workers must know it", unknown)
+        log.warning("service.host cannot be resolved here (%s); workers must be able to", unknown)
     where: dict[str, Any] = {
         "endpoint": announced(hub.endpoint, host),
         "weights_endpoint": announced(hub.weights_endpoint, host),
@@ -226,7 +226,7 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
-    """Keys where the sockets must be encrypted."""
+    """The keys of the run; None, with a warning if need be, if the sockets are not encrypted."""
     if needs_keys(service):
         return run_keys(folder.keys)
     if service.bind != LOCAL:
@@ -237,7 +237,7 @@ def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
 def _make_trainer(
     config: MasterConfig, setup: Setup, folder: RunFolder, watchdog: Watchdog
 ) -> tuple[Trainer, Restored | None]:
-    """What learns, with the newest checkpoint, or the networks of another run, where asked for."""
+    """The trainer, restored from the newest checkpoint or warm-started if the settings say so."""
     service = config.service
     torch.set_num_threads(service.threads)
     keep_memory()
@@ -249,7 +249,7 @@ def _make_trainer(
         if config.warm_start is not None:
             warm_start(Path(config.warm_start), trainer)
     if service.compile:
-        log.info("compiles its update: minutes at first, seconds once it was compiled here")
+        log.info("compiling the update: the first time takes minutes, later times seconds")
     with watchdog.patient():
         trainer.learner.prepare()
     return trainer, found
@@ -263,17 +263,17 @@ def _insert_again(
     lockstep: Lockstep | None,
     watchdog: Watchdog,
 ) -> None:
-    """Take in batches of the journal that the checkpoint does not cover."""
+    """Insert the batches of the journal that are not in the checkpoint."""
     trainer, before = guard.trainer, guard.trainer.episodes
     for batch in batches:
         watchdog.progress()
         if not hub.recover(batch):
             continue
-        # In lockstep a round begins when the updates of those before it are made.
+        # In lockstep, all updates of the rounds before come first.
         if lockstep is not None and lockstep.begins_round(trainer.episodes):
             while trainer.rate_limiter.may_update() and not budget.updates_spent():
                 watchdog.progress()
                 guard.update(budget.share)
         trainer.insert(batch.episodes)
     if trainer.episodes > before:
-        log.info("%s episodes come back from the journal", f"{trainer.episodes - before:,}")
+        log.info("%s episodes restored from the journal", f"{trainer.episodes - before:,}")

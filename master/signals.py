@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM, SIGHUP, SIGUSR1: the first asks for a clean end, the second ends."""
+"""SIGINT, SIGTERM, SIGHUP, SIGUSR1: the first asks for a clean end, the second ends at once."""
 
 import os
 import signal
@@ -10,21 +10,22 @@ from tangram_core.run.outcome import CTRL_C
 from tangram_core.run.process import handling
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
-# One wish to end may arrive twice: a time limit signals a process and then its whole group.
+# Signals this close together count as one: at a time limit, a scheduler may signal a process and
+# then its whole group.
 SAME_WISH_S = 1.0
 SHOW_CURSOR = b"\x1b[?25h\n"
 
 
 def stop_notice(name: str) -> str:
-    """What the user reads when the signal of this name ends a run."""
-    return f"{CTRL_C.get(name, name)}: the run ends with a checkpoint, again to end at once"
+    """The line for the user when the signal of this name ends a run."""
+    return f"{CTRL_C.get(name, name)}: the run ends with a checkpoint; repeat it to end at once"
 
 
 class StopSignals:
-    """Catches the signals while it is entered.
+    """A context manager that catches the signals.
 
     Attributes:
-        reason: name of the first signal, or None.
+        reason: name of the first signal; None before.
     """
 
     def __init__(self) -> None:
@@ -49,6 +50,6 @@ class StopSignals:
 
 
 def show_cursor() -> None:
-    """Show the cursor again, which a live panel that was killed had hidden."""
+    """Show the cursor again if stdout is a terminal; a live panel that was killed hides it."""
     if sys.stdout.isatty():
         os.write(sys.stdout.fileno(), SHOW_CURSOR)

@@ -1,7 +1,7 @@
-"""The agents, and what they are made of, on the interface of `tangram_core.agent`.
+"""The agents, which implement the interface of `tangram_core.agent`, and their shared parts.
 
-`agents/` has a folder for each: `scene` (the paper's), `pair`, `outline`, `goal`. `base/` is what
-agents of tokens share, `flat/` what agents of rows of numbers share, `nets/` are layers. `runs.py`
-loads a finished run. May import tangram_tasks, tangram_sim and tangram_core; start with
-`agents/scene/agent.py`.
+`agents/` has a folder for each agent: `scene` (the paper's), `pair`, `outline`, `goal`, `push`.
+`base/` is shared by agents of tokens, `flat/` by agents of rows of numbers. `nets/` has network
+layers. `runs.py` loads a finished run. Start with `agents/scene/agent.py`. May import
+tangram_tasks, tangram_sim and tangram_core.
 """

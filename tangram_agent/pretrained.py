@@ -1,8 +1,8 @@
-"""Agents that come with the package: `pretrained/<name>` wherever a run folder is expected.
+"""Pretrained agents in the package: `pretrained/<name>` works in place of a run folder.
 
-An agent's folder holds `config.yaml` (the sections that make a setup), `weights.safetensors` (the
-acting actor alone), and `card.json`. `tangram_lab.experiments.pretrained` makes such
-folders; one that lies anywhere else is read in the same way.
+The folder of an agent holds `config.yaml` (the sections of its setup), `weights.safetensors` (only
+the actor), and `card.json`. `tangram_lab.experiments.pretrained` makes such folders. They are read
+in the same way from any other place.
 """
 
 import hashlib
@@ -24,28 +24,28 @@ PACKAGED: Traversable = files("tangram_agent") / PREFIX
 
 
 def agent_names() -> list[str]:
-    """The agents that come with the package."""
+    """Names of the agents that come with the package, sorted."""
     if not PACKAGED.is_dir():
         return []
     return sorted(entry.name for entry in PACKAGED.iterdir() if is_agent(entry))
 
 
 def is_agent(folder: Traversable) -> bool:
-    """Whether a folder is an agent's: it has a card, which no run folder has."""
+    """Whether a folder holds a pretrained agent: it has a `card.json`, which run folders lack."""
     return folder.is_dir() and (folder / CARD).is_file()
 
 
 def is_name(run_dir: str | Path) -> bool:
-    """Whether a run_dir reads `pretrained/<name>`."""
+    """Whether `run_dir` has the form `pretrained/<name>`."""
     parts = Path(run_dir).parts
     return len(parts) == 2 and parts[0] == PREFIX
 
 
 def packaged(run_dir: str | Path) -> Traversable:
-    """The package's folder of `pretrained/<name>`.
+    """The folder inside the package for `pretrained/<name>`.
 
     Raises:
-        RunError: no agent of that name; lists those that there are.
+        RunError: no agent has this name; lists the known names.
     """
     name = Path(run_dir).name
     names = agent_names()
@@ -56,18 +56,18 @@ def packaged(run_dir: str | Path) -> Traversable:
 
 
 def read_agent(folder: Traversable, shown: str | Path) -> tuple[str, Weights]:
-    """Read an agent's folder, with every byte of its weights checked.
+    """Read the folder of a pretrained agent and check the checksum of its weights.
 
     Args:
-        folder: where it lies.
-        shown: what errors call it.
+        folder: the folder to read.
+        shown: name of the folder in error messages.
 
     Returns:
-        The text of its config.yaml, and the weights of the acting actor; their version is the
+        The text of config.yaml, and the weights of the actor. The version of the weights is the
         number of updates.
 
     Raises:
-        RunError: a file is missing, changed, or of another format.
+        RunError: a file is missing or changed, or has another format.
     """
     try:
         config = (folder / CONFIG).read_text(encoding="utf-8")
@@ -92,7 +92,7 @@ def _check_card(card: object, data: bytes, shown: str | Path) -> None:
             "version of tangram-rl that wrote it"
         )
     if not isinstance(card.get("updates"), int):
-        raise _damaged(shown, f"{CARD} does not tell the updates")
+        raise _damaged(shown, f"{CARD} has no number of updates")
     if card.get("sha256") != hashlib.sha256(data).hexdigest():
         raise _damaged(shown, f"checksum of {WEIGHTS} differs")
 

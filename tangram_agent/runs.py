@@ -1,8 +1,8 @@
-"""Loading a finished run: its config, its setup and the actor that it learned.
+"""Load a finished run: its config, its setup and its trained actor.
 
-`load_run("runs/my-run").predict(observation)` gives actions for what gymnasium's environment shows,
-docs/gymnasium.md has whole examples; `Run.act` gives them for corners, see docs/inference.md.
-`load_run("pretrained/square")` gives one of the agents that come with the package.
+`load_run("runs/my-run").predict(observation)` gives actions for observations of the gymnasium
+environment, see docs/gymnasium.md. `Run.act` gives actions for corners, see docs/inference.md.
+`load_run("pretrained/square")` loads one of the agents that come with the package.
 """
 
 import math
@@ -54,14 +54,14 @@ Changes = Mapping[str, Mapping[str, Any]]  # section -> setting -> value
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run that was read from its folder.
+    """A finished run, loaded from its folder.
 
     Attributes:
-        folder: the run folder, as it was named; `pretrained/<name>` for one of the package.
-        config: the resolved config that it was trained with; only what makes the setup for an
-            agent of the package.
+        folder: the run folder as given; `pretrained/<name>` for a pretrained agent.
+        config: the resolved config of the training; for a pretrained agent only the sections of
+            its setup.
         setup: the task and the agent.
-        weights: as the checkpoint has them; their version is the number of updates.
+        weights: the actor's weights; their version is the number of updates.
     """
 
     folder: Path
@@ -71,51 +71,51 @@ class Run:
 
     @property
     def updates(self) -> int:
-        """Of the weights that were loaded."""
+        """Number of updates before the loaded weights were saved."""
         return self.weights.version
 
     @cached_property
     def actor(self) -> Actor:
-        """Acts with these weights."""
+        """An actor with the loaded weights."""
         actor = self.setup.agent.actor(self.setup.task)
         actor.load(self.weights.tensors)
         return actor
 
     @property
     def task(self) -> Place:
-        """The task, which is one of tokens.
+        """The task of the run, which must be one of tokens.
 
         Raises:
-            ConfigError: it is not.
+            ConfigError: the run has another kind of task.
         """
         if not isinstance(self.setup.task, Place):
             raise ConfigError(
-                f"{self.folder} plays task={self.setup.task_kind}: ask it by act, as "
-                "docs/inference.md has it, or name a run of task=place"
+                f"{self.folder} plays task={self.setup.task_kind}: use Run.act, as "
+                "docs/inference.md shows, or give a run of task=place"
             )
         return self.setup.task
 
     def act(self, seen: Arrays, past: History | None = None) -> Singles:
-        """Actions (B, A) in [-1, 1], exploration off.
+        """Actions (B, A) in [-1, 1], without exploration.
 
         Args:
-            seen: the fields that the task's spec names, B rows each: of tokens their corners (B, V,
-                2), which are placed (B, K), and goals (B, V, 2), or (B, G, 2) rows of outlines.
-            past: what was seen of these episodes before, if anything.
+            seen: the fields in the task's spec, B rows each. For tokens: `corners` (B, V, 2),
+                `placed` (B, K), and `goals` as corners (B, V, 2) or rows of outlines (B, G, 2).
+            past: earlier moments and actions of these episodes; None: the episodes begin now.
         """
         return self.actor.act(seen, past or beginning(self.setup.spec, seen))
 
     def predict(self, observation: Mapping[str, Any]) -> Singles:
-        """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
+        """Actions for an observation, without exploration and without memory of earlier steps.
 
         Args:
-            observation: of a `TaskEnv`, or of several: each entry with B rows then.
+            observation: from one `TaskEnv`, or from B of them with B rows in each entry.
 
         Returns:
-            (A,) in [-1, 1], which `step` takes; (B, A) for B rows.
+            (A,) in [-1, 1], as `TaskEnv.step` takes it; (B, A) for B rows.
 
         Raises:
-            ConfigError: an observation of another form, or of another set of tokens.
+            ConfigError: the observation has another form, or another set of tokens.
         """
         spec, shown = self.setup.spec, self._checked(observation)
         desired = spec.field(spec.desired)
@@ -130,7 +130,7 @@ class Run:
         return single
 
     def _checked(self, observation: object) -> dict[str, Floats]:
-        """The entries as arrays, all for as many rows."""
+        """The entries of an observation as arrays, all with the same number of rows."""
         spec = self.setup.spec
         size = {one.name: math.prod(one.shape) for one in spec.fields}
         wanted = {
@@ -144,7 +144,7 @@ class Run:
                 given = ", ".join(map(str, observation))
             raise ConfigError(
                 f"an observation is a dict of {', '.join(wanted)}, got {given or 'an empty one'}: "
-                "give what reset or step returns first"
+                "give the observation that reset or step returns"
             )
         try:
             shown = {name: np.asarray(observation[name], dtype=np.float64) for name in wanted}
@@ -154,9 +154,9 @@ class Run:
         for name, count in wanted.items():
             if shown[name].shape != (*rows, count) or 0 in rows:
                 raise ConfigError(
-                    f"observation['{name}'] has shape {shown[name].shape}, and {self.folder} wants "
-                    f"{(*(max(1, row) for row in rows), count)}: give what tangram_tasks.goal_env."
-                    "TaskEnv(run.setup.task) shows"
+                    f"observation['{name}'] has shape {shown[name].shape}, but {self.folder} needs "
+                    f"{(*(max(1, row) for row in rows), count)}: use observations of tangram_tasks."
+                    "goal_env.TaskEnv(run.setup.task)"
                 )
             if not (np.abs(shown[name]) <= MAX_COORDINATE).all():
                 raise ConfigError(
@@ -166,16 +166,16 @@ class Run:
         return shown
 
     def unlearned(self) -> "Run":
-        """The same run with all weights 0, so that it values everything alike."""
+        """A copy of the run with all weights 0, so that its networks have no preferences."""
         none = {name: np.zeros_like(one) for name, one in self.weights.tensors.items()}
         return replace(self, weights=replace(self.weights, tensors=none))
 
     def with_settings(self, changes: Changes) -> "Run":
-        """The same weights, played with other settings: `{"agent": {"reapply": 1}}`.
+        """A copy of the run that plays with other settings, such as `{"agent": {"reapply": 1}}`.
 
         Raises:
-            ConfigError: a setting that the weights were trained for or that was for learning only,
-                or a value that this run cannot be played with.
+            ConfigError: the weights depend on the setting, the setting is only for learning, or
+                the run cannot play with the value.
         """
         given = [f"{s}.{name}={told(v)}" for s, own in changes.items() for name, v in own.items()]
         if not given:
@@ -198,7 +198,7 @@ class Run:
 
 
 def _check_playable(trained: Settings, values: Mapping[str, Any]) -> None:
-    """Refuse what is no matter of a trained run's play."""
+    """Refuse settings that cannot be changed after the training."""
     for own in declared_fields(type(trained)):
         if own.name not in values:
             continue
@@ -211,7 +211,7 @@ def _check_playable(trained: Settings, values: Mapping[str, Any]) -> None:
 
 
 def _refuse_other(name: str, given: object, was: object) -> None:
-    """What the weights are of cannot be changed."""
+    """Refuse another value of a setting on which the weights depend."""
     raise ConfigError(
         f"{name}={told(given)} does not fit this run, whose weights were trained with "
         f"{name}={told(was)}: leave it out, or {ANOTHER}"
@@ -219,18 +219,18 @@ def _refuse_other(name: str, given: object, was: object) -> None:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """A run's resolved config.
+    """The resolved config of a run, by section.
 
     Raises:
-        RunError: the file is missing or no mapping.
-        ConfigError: it is no YAML, or larger than settings are.
+        RunError: the file is missing, or does not hold a mapping.
+        ConfigError: the file is not YAML, or too large for settings.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise RunError(f"cannot read {path} ({error.strerror}): is this a run folder?") from None
     except UnicodeDecodeError:
-        raise RunError(f"{path} is not valid YAML (it is no UTF-8): mend it") from None
+        raise RunError(f"{path} is not valid YAML (it is not UTF-8): correct it") from None
     return _parse_config(text, path)
 
 
@@ -242,25 +242,25 @@ def _parse_config(text: str, path: Path) -> dict[str, Any]:
 
 
 def load_run(run_dir: str | Path, checkpoint: str | None = None, reward: str | None = None) -> Run:
-    """A run with the weights of its newest checkpoint, or of the one that is named.
+    """Load a run with the weights of its newest checkpoint, or of a named one.
 
     Args:
-        run_dir: the run folder, or `pretrained/<name>` for an agent that comes with the package;
-            a folder of that name wins.
+        run_dir: the run folder, or `pretrained/<name>` for an agent that comes with the package.
+            If a folder of that name exists, it is loaded instead.
         checkpoint: name of a folder under `checkpoints`, such as 00004000.
-        reward: `reward.name` in place of the run's. A run that was trained with code of somebody's
-            own must be told it again, or `overlap`: its files alone have no code loaded.
+        reward: `reward.name` in place of the run's. If that is a user's code, give the code again,
+            or `overlap`: code is never loaded because a run's files name it.
 
     Raises:
         RunError: the folder, its config or the checkpoint is missing or corrupt, or the weights
             do not fit the config.
-        ConfigError: the config is not one that this version can use, or names code.
+        ConfigError: this version cannot use the config, or the config names code.
     """
     return _acting(_read(Path(run_dir), checkpoint, reward))
 
 
 def load_changed(run_dir: str | Path, changes: Changes) -> Run:
-    """A run, played with other settings; a reward that is code must be among them.
+    """Load a run to play with other settings; a reward that is code must be among them.
 
     Raises:
         TangramError: see `load_run` and `Run.with_settings`.
@@ -269,13 +269,13 @@ def load_changed(run_dir: str | Path, changes: Changes) -> Run:
 
 
 def read_changed(run_dir: str | Path, changes: Changes) -> Run:
-    """The same, read without torch: what is not asked for its actor needs none."""
+    """Like `load_changed`, but without making the actor, so that torch is not imported."""
     reward = changes.get("reward", {}).get("name")
     return _read(Path(run_dir), None, reward).with_settings(changes)
 
 
 def _acting(run: Run) -> Run:
-    _ = run.actor  # refuses weights of another network here, not where it first plays
+    _ = run.actor  # made here, so that weights of another network are refused at once
     return run
 
 
@@ -314,10 +314,10 @@ def _trained(folder: Path, checkpoint: str | None, reward: str | None) -> Run:
     config = _with_reward(read_config(folder / CONFIG), reward)
     checkpoints = folder / CHECKPOINTS
     path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
-    # First, as it tells a run of another version by its format.
+    # Loaded first: its format shows whether another version wrote the run.
     content = load_checkpoint(path, [ACTING])
     setup = make_setup(config)
-    # Where it plays may change: another backend or another reward does not change the policy.
+    # The backend of the simulation and the reward may differ: the policy stays the same.
     known = content.counters.get(SETUP, {})
     odd = [name for name in setup.differences(known) if name in POLICY_SECTIONS]
     odd += setup.meant_otherwise(known, "sim")

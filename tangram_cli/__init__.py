@@ -1,1 +1,1 @@
-"""The entry of every command. Start with `commands.py`; it imports our packages late, by name."""
+"""Entry points of all commands. Start with `commands.py`; it imports other packages by name."""

@@ -1,4 +1,4 @@
-"""`python -m tangram_cli train ...` is `tangram-train ...`; so commands start one another."""
+"""`python -m tangram_cli train ...` is `tangram-train ...`; commands start each other this way."""
 
 import sys
 

@@ -1,8 +1,8 @@
-"""The entry of every command: our packages are found before other modules of their names.
+"""Entry points of all commands; they protect the imports of `conf`, `master` and `worker`.
 
-`conf`, `master` and `worker` are names that files of a user may have, too. A `master.py` in the
-current folder or on PYTHONPATH would be imported in place of ours, so whoever comes through this
-door finds these three beside this package, wherever else they may lie.
+Files of a user may have these names, too. A `master.py` in the current folder or on PYTHONPATH
+would be imported in place of ours. So every command first makes Python look for these three
+packages beside this one.
 """
 
 import os
@@ -20,32 +20,32 @@ COMMON_NAMES = frozenset({"conf", "master", "worker"})
 
 
 class OwnPackages:
-    """Finds the packages with common names beside this one, before sys.path is asked."""
+    """Import finder: looks for COMMON_NAMES beside this package, before sys.path."""
 
     @staticmethod
     def find_spec(
         fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """As `importlib.abc.MetaPathFinder`."""
+        """The spec of a package in COMMON_NAMES, else None; see `importlib.abc.MetaPathFinder`."""
         if path is not None or fullname not in COMMON_NAMES:
             return None
         return PathFinder.find_spec(fullname, [str(HOME)], target)
 
 
 def own_packages_first() -> None:
-    """From here on."""
+    """Put `OwnPackages` first among the import finders of this process."""
     if OwnPackages not in sys.meta_path:
         sys.meta_path.insert(0, OwnPackages)
 
 
 def run(module: str, function: str) -> int:
-    """Run a command out of our packages and return its exit status; 130 after Ctrl-C."""
+    """Run a function of a module as a command and return its exit status; 130 after Ctrl-C."""
     own_packages_first()
-    # numpy multiplies small matrices here: more threads wait for each other, longer than they
-    # compute, the more so beside other work. Before numpy is imported.
+    # Must be set before numpy is imported. The matrices here are small: several threads would wait
+    # for each other longer than they compute, above all on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        # Late: what a command needs may only be imported once our packages come first.
+        # Imported here, because our packages must come first on the import path before that.
         command: Callable[[], int] = getattr(import_module(module), function)
         return command()
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""What the server of `master.forking` does before it forks: all that every process imports."""
+"""Start of the fork server of `master.forking`: imports once what every process needs."""
 
 from importlib import import_module
 

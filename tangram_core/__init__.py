@@ -1,6 +1,6 @@
-"""What master, workers, tasks and agents share: two interfaces, and how they speak and keep things.
+"""Shared code of master, workers, tasks and agents: interfaces, settings, messages and files.
 
-Start with `task.py` and `agent.py`: who implements them has the whole service. `spec.py` says what
-an episode is made of. `settings.py` is how settings are declared, `run/process.py` what every
-process needs; files are in `store`, addresses in `wire`. May import no other package of ours.
+Start with `task.py` and `agent.py`: a class that implements one of them can use the whole service.
+`spec.py` declares the arrays of an episode, `settings.py` the settings. `run/process.py` has what
+every process needs, `store` the files, `wire` the messages. May import no other package of ours.
 """

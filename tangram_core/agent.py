@@ -1,4 +1,4 @@
-"""The interface of an agent: who acts in workers, and who learns in the master.
+"""The interface of an agent: the actor that plays in workers, the learner in the master.
 
 Legend: E episodes, B environments, T steps of an episode, A entries of an action.
 """
@@ -18,7 +18,7 @@ from tangram_core.task import Generators, History, Json, Task
 
 Streams = Mapping[str, np.random.Generator]
 Tensors = dict[str, Singles]
-AT_ONCE = 32  # environments that are played at a time where an agent is shown or scored
+AT_ONCE = 32  # environments played at a time when an agent is shown or scored
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,8 @@ class Weights:
     """The weights that workers play with.
 
     Attributes:
-        version: number of the broadcast, rising within an epoch.
-        tensors: name -> float32 array of the acting network, or of what of it travels.
+        version: number of the broadcast; it rises within an epoch.
+        tensors: name -> float32 array, for `Actor.load`.
     """
 
     version: int
@@ -35,16 +35,16 @@ class Weights:
 
 
 class NotFiniteError(RunError):
-    """Numbers of an update, or weights, that are not finite."""
+    """Numbers of an update, or weights, are NaN or infinite."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How much an agent learns from what is played.
+    """Number of updates that an agent makes for the transitions that are played.
 
     Attributes:
-        updates_per_transition: updates for each transition that can be learned from.
-        learning_starts: such transitions before the first update.
+        updates_per_transition: updates for each transition that the agent can learn from.
+        learning_starts: number of these transitions before the first update.
     """
 
     updates_per_transition: float
@@ -52,19 +52,19 @@ class Pace:
 
 
 class Actor(ABC):
-    """Who acts in a worker: on the CPU, with one thread, for B environments at a time."""
+    """Chooses actions in a worker: on the CPU, in one thread, for B environments at a time."""
 
     @property
     @abstractmethod
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Names and shapes of the tensors that `load` takes: what a broadcast must hold."""
+        """Names and shapes of the tensors that `load` takes and a broadcast must hold."""
 
     @abstractmethod
     def load(self, weights: Mapping[str, Singles]) -> None:
-        """Take over weights, as `Learner.broadcast` gives them.
+        """Load the weights that `Learner.broadcast` returned.
 
         Raises:
-            RunError: they are of another network.
+            RunError: the weights belong to another network.
         """
 
     @abstractmethod
@@ -73,41 +73,41 @@ class Actor(ABC):
 
         Args:
             seen: the task's fields of this moment and of the episode, B rows each.
-            past: what was seen and done in these episodes before.
-            explore: a generator for each environment, where it explores; all that is drawn for an
-                environment comes from its own, so that it plays alike whoever plays beside it.
-                None: as well as it can.
+            past: earlier observations and actions of the same episodes.
+            explore: one generator for each environment, to explore with. All random numbers of an
+                environment must come from its own generator, so that its actions do not depend on
+                the other environments. None: the best actions, without exploration.
         """
 
     def graph(self) -> Any:
-        """All of `act` without exploring as one network, for whoever plays it without torch.
+        """`act` without exploration as one network, to export it for use without torch.
 
         Returns:
             A torch.nn.Module. Its `forward` takes the task's fields by name, (B, *shape) float32,
-            and gives actions (B, A).
+            and returns actions (B, A).
 
         Raises:
-            ConfigError: it is more than a network, as a search is.
+            ConfigError: the actor is more than a network, for example a search.
         """
         raise ConfigError(
             f"{type(self).__name__} is more than a network: it searches, or has no graph() of its "
-            "own: play it by tangram_agent.runs.load_run, as docs/inference.md has it"
+            "own: play it with tangram_agent.runs.load_run, see docs/inference.md"
         )
 
 
 class Learner(ABC):
-    """Who learns in the master: networks, optimisers and replay.
+    """Learns in the master: networks, optimisers and replay buffer.
 
-    Whatever it draws comes from the generators that it is handed, whose state the master saves: so
-    a run that is resumed goes on as if it had never stopped.
+    A learner takes all random numbers from the generators that its methods are given. The master
+    saves their state, so that a resumed run goes on as if it had never stopped.
 
     Attributes:
-        streams: names of those generators; stream i of a run with a seed is seeded [seed, i].
-        advice: what to change where numbers are no longer finite, in an error's words.
-        updates: made so far.
-        parameters: numbers that are learned.
-        device: where, for reports.
-        capacity: transitions that are kept, or states, at most.
+        streams: names of the generators; generator i of a run is seeded with [seed, i].
+        advice: remedy in the error that tells of numbers that are no longer finite.
+        updates: number of updates so far.
+        parameters: number of trainable parameters.
+        device: device of the networks, for reports.
+        capacity: most transitions, or states, that the replay buffer holds.
     """
 
     streams: tuple[str, ...] = ("replay", "hindsight")
@@ -119,80 +119,80 @@ class Learner(ABC):
 
     @abstractmethod
     def insert(self, episodes: Episodes, rng: Streams) -> int:
-        """Keep what is to be learned from episodes, with whatever hindsight makes of them.
+        """Add episodes to the replay buffer, with the transitions that hindsight adds.
 
         Returns:
-            How many of their transitions can be learned from: the pace counts these.
+            Number of their transitions that can be learned from; `Pace` counts these.
         """
 
     @abstractmethod
     def update(self, share: float, rng: Streams) -> dict[str, float]:
-        """One update of all networks, from what is kept.
+        """Update all networks once, from the replay buffer.
 
         Args:
-            share: of the run's budget that is used, in [0, 1]; 0 where it has none.
-            rng: the generators.
+            share: used share of the run's budget, in [0, 1]; 0 if the run has no budget.
+            rng: the generators, by the names in `streams`.
 
         Returns:
-            Its numbers, for the curves.
+            Losses and other numbers of the update, for the curves.
 
         Raises:
-            NotFiniteError: one of them is not finite. The update does not count, and the networks
-                may be spoilt: the master loads a state from before.
+            NotFiniteError: one of the numbers is not finite. The update does not count. The
+                networks may be damaged, so the master loads an earlier state.
         """
 
     @abstractmethod
     def broadcast(self) -> Tensors:
-        """What workers need to play: `Actor.load` takes it."""
+        """Tensors that workers play with, for `Actor.load`."""
 
     @abstractmethod
     def state(self) -> dict[str, Array]:
-        """Networks, optimisers and counters: all but the replay that the next update hangs on."""
+        """Networks, optimisers and counters: all that the next update needs except the replay."""
 
     @abstractmethod
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state.
+        """Load what `state` returned.
 
         Raises:
-            RunError: it is of another network or task, or not whole.
+            RunError: the state belongs to another network or task, or is incomplete.
         """
 
     @abstractmethod
     def memory(self) -> dict[str, Array]:
-        """The replay, for a checkpoint; views will do."""
+        """Arrays of the replay buffer, for a checkpoint; views are allowed."""
 
     @abstractmethod
     def load_memory(self, memory: Mapping[str, Array]) -> None:
-        """Take over a replay.
+        """Load what `memory` returned.
 
         Raises:
-            RunError: it is of another task, or not whole.
+            RunError: the replay buffer belongs to another task, or is incomplete.
         """
 
     @property
     @abstractmethod
     def kept(self) -> int:
-        """Transitions, or states, in the replay."""
+        """Number of transitions, or states, in the replay buffer."""
 
     def export(self) -> Tensors:
-        """What a finished run is played with; a broadcast may hold less of it."""
+        """Tensors that a finished run is played with; a broadcast may hold fewer."""
         return self.broadcast()
 
     def begin_with(self, state: Mapping[str, Array]) -> None:
-        """Take over what another run learned, in the place of random weights."""
+        """Begin with the state of another run instead of random weights."""
         self.load_state(state)
 
     def evidence(self) -> Arrays:
-        """What the last update learned from, for whoever looks for the cause of a failure."""
+        """Arrays that the last update learned from, to find the cause of a failure."""
         return {}
 
     def prepare(self) -> None:  # noqa: B027
-        """Do ahead of time what the first update would take long for."""
+        """Do slow work of the first update in advance, such as compiling."""
 
 
 @dataclass(frozen=True)
 class Agent(ABC):
-    """How a task is learned: settings, and who is made of them.
+    """A method to learn a task: settings, from which an actor and a learner are made.
 
     An agent is a frozen dataclass whose fields are the sections of its settings, as a task is (see
     `tangram_core.task.Task`):
@@ -202,12 +202,12 @@ class Agent(ABC):
             sections: ClassVar = {"agent": TD3Config}
             config: TD3Config = TD3Config()
 
-    To make one loads nothing heavy: `actor` and `learner` import torch when they are called. A
-    worker calls `actor`, the master `learner`. They agree on settings by `identity`, and on nothing
-    else: what the learner broadcasts, the actor loads.
+    Creating an agent must not load torch: `actor` and `learner` import it when they are called. A
+    worker calls `actor`, the master calls `learner`. The two processes compare `identity` only. The
+    actor loads what the learner broadcasts.
 
-    What must be there: `pace`, `actor` and `learner`. What may: `check`, `check_training` and
-    `facts`.
+    A subclass must define `pace`, `actor` and `learner`. It may define `check`, `check_training`
+    and `facts`.
     """
 
     sections: ClassVar[Mapping[str, type[Settings]]] = {}
@@ -215,44 +215,44 @@ class Agent(ABC):
     @property
     @abstractmethod
     def pace(self) -> Pace:
-        """How much it learns from what is played."""
+        """Number of updates that the agent makes for the transitions that are played."""
 
     @abstractmethod
     def actor(self, task: Task) -> Actor:
-        """Who acts, with weights that are to be loaded."""
+        """An actor for the task. Its weights are loaded afterwards."""
 
     @abstractmethod
     def learner(self, task: Task, seed: int, device: str, *, compiled: bool = False) -> Learner:
-        """Who learns, with the weights of a seed.
+        """A learner for the task.
 
         Args:
-            task: what is played.
-            seed: of the weights.
-            device: of torch.
+            task: the task to learn.
+            seed: seed of the initial weights.
+            device: the torch device.
             compiled: whether updates are compiled.
 
         Raises:
-            ConfigError: it cannot do it so.
+            ConfigError: the agent cannot learn with these arguments.
         """
 
     def check_training(self, *, compiled: bool = False) -> None:  # noqa: B027
-        """Refuse settings that are for playing a finished run alone, or to compile what cannot be.
+        """Refuse settings that are only for playing, and `compiled` if updates cannot be compiled.
 
         Raises:
             ConfigError: names the setting.
         """
 
     def check(self, task: Task) -> None:  # noqa: B027
-        """Refuse a task that it cannot play, or settings that would change nothing with it.
+        """Refuse a task that the agent cannot play, or settings without effect on the task.
 
         Raises:
             ConfigError: names the setting and the remedy.
         """
 
     def identity(self) -> Json:
-        """Section -> what it says: what master and workers must have alike."""
+        """Section -> its settings, which must be equal in master and workers."""
         return {n: asdict(getattr(self, "config" if n == "agent" else n)) for n in self.sections}
 
     def facts(self) -> Json:
-        """What result.json tells of the agent."""
+        """Facts about the agent for result.json."""
         return {}

@@ -1,10 +1,10 @@
-"""Does a task, or an agent, keep the promises of its interface? For whoever writes one.
+"""Checks that a task or an agent keeps the promises of its interface, for its author.
 
     check_task(Point())
     check_agent(TD3(), Point())
 
-Each raises one line at the first broken promise: the class, the method, what was wanted and what
-came. An agent should be small for this, it makes a few updates.
+Each raises an error of one line at the first broken promise. The error names the class, the method,
+what was wanted and what came. Use small networks: the agent makes a few updates.
 
 Legend: B environments, E episodes, T steps of an episode, A entries of an action.
 """
@@ -24,31 +24,31 @@ from tangram_core.spec import ACTIONS, OWN, REWARDS, TERMINATED, Array, Arrays, 
 from tangram_core.task import Env, Generators, History, Played, Step, Task
 
 Act = Callable[[Arrays, History, Generators], Singles]
-CLOSE = 1e-5  # between an action of one row and of the same row among others
+CLOSE = 1e-5  # greatest difference of an action computed alone and beside other rows
 
 
 class ConformanceError(TangramError):
-    """A promise of an interface that is not kept."""
+    """A task or an agent breaks a promise of its interface."""
 
 
 _AS_GOOD: dict[str, tuple[Any, ...]] = {"f4": (np.float64,), "u1": (np.bool_,)}
 
 
 def check_task(task: Task, count: int = 3) -> None:
-    """Play a task with random actions, side by side, and hold it to `Task` and `Env`.
+    """Check a task against `Task` and `Env`: play it with random actions in `count` environments.
 
     Raises:
         ConformanceError: names the class, the method, what was wanted and what came.
     """
     task.check(plays=True)
     if task.spec != task.spec:
-        _fail(task, "spec", "the same whenever it is asked", "two that differ")
+        _fail(task, "spec", "the same spec at every call", "two that differ")
     _check_json(task, task.identity())
     env = task.make(count, "test")
     try:
         played = play(task, env, _generators(count), _random(task))
         again = play(task, env, _generators(count), _random(task))
-        _check_same(env, "reset", "the same of the same generators", played, again)
+        _check_same(env, "reset", "the same episodes from the same generators", played, again)
         _check_rewards(task, played.episodes)
         _check_score(task, played)
         for name, made in task.rivals().items():
@@ -63,13 +63,13 @@ def check_task(task: Task, count: int = 3) -> None:
             own = Played(
                 played.episodes.at([i]), {name: fact[[i]] for name, fact in played.facts.items()}
             )
-            _check_same(alone, "step", "an episode as it is beside others", own, one)
+            _check_same(alone, "step", "an episode alone to equal the one beside others", own, one)
     finally:
         alone.close()
 
 
 def check_agent(agent: Agent, task: Task, device: str = "cpu") -> None:
-    """Let an agent of small networks play and learn a task; hold it to `Agent`, `Actor`, `Learner`.
+    """Check an agent against `Agent`, `Actor` and `Learner`: let it play and learn a task.
 
     Raises:
         ConformanceError: names the class, the method, what was wanted and what came.
@@ -103,7 +103,7 @@ def check_agent(agent: Agent, task: Task, device: str = "cpu") -> None:
 
 
 def play(task: Task, env: Env, generators: Generators, act: Act) -> Played:
-    """Episodes of all environments, each field and step checked against the spec."""
+    """Play one episode in each environment; check each field and step against the spec."""
     spec, count = task.spec, env.count
     arrays = dict(spec.empty(count).arrays)
     seen = env.reset(generators)
@@ -157,11 +157,11 @@ def _check_step(env: Env, step: Step, task: Task) -> None:
 
 def _check_array(owner: object, method: str, field: Field, array: Array, count: int) -> None:
     wanted = (count, *field.shape)
-    # What is more exact is rounded when it is kept, and a flag is a number.
+    # float64 is rounded when it is stored, and bool becomes a number.
     if array.shape != wanted or array.dtype not in (field.dtype, *_AS_GOOD[field.dtype]):
         came = f"{array.dtype} {array.shape}"
         _fail(owner, method, f"{field.name} to be {np.dtype(field.dtype)} {wanted}", came)
-    if not ((field.low <= array) & (array <= field.high)).all():  # nor is a NaN
+    if not ((field.low <= array) & (array <= field.high)).all():  # false for NaN
         came = f"{array.min():g} to {array.max():g}"
         _fail(owner, method, f"{field.name} within {field.low:g} and {field.high:g}", came)
 
@@ -181,17 +181,17 @@ def _check_rewards(task: Task, episodes: Episodes) -> None:
     recorded = episodes.terminated.reshape(-1).astype(bool)
     found = np.asarray(task.rewards(achieved, desired))
     if found.shape != (size,):
-        _fail(task, "rewards", f"({size},) of as many goals", found.shape)
+        _fail(task, "rewards", f"shape ({size},) for {size} goals", found.shape)
     paid = episodes.rewards.reshape(-1)
     if not np.allclose(found, paid, rtol=1e-4, atol=1e-5):
         worst = int(np.abs(found - paid).argmax())
         _fail(task, "rewards", f"what the step was paid, {paid[worst]:g}", f"{found[worst]:g}")
     ended = np.asarray(task.ended(achieved, desired, recorded))
     if ended.shape != (size,) or ended.dtype != bool or not np.array_equal(ended, recorded):
-        _fail(task, "ended", "bool, as the steps recorded it for their own goal", ended)
+        _fail(task, "ended", "bool, as recorded by the steps for their own goal", ended)
     alone = np.concatenate([task.rewards(achieved[i : i + 1], desired[i : i + 1]) for i in (0, -2)])
     if not np.allclose(alone, found[[0, -2]]):
-        _fail(task, "rewards", "the same for a row alone", alone)
+        _fail(task, "rewards", "the same reward for a row alone", alone)
     goals = achieved[::-1].copy()
     goals[::2] = achieved[::2]  # half of the other goals are reached
     hindsight = task.rewards(achieved, goals).astype("f4")
@@ -200,7 +200,7 @@ def _check_rewards(task: Task, episodes: Episodes) -> None:
     rows = [slice(i, i + 1) for i in range(size)]
     single = [task.ended(achieved[i], goals[i], recorded[i]) for i in rows]
     if not np.array_equal(every, np.concatenate(single)):
-        _fail(task, "ended", "the same for a row alone", "another")
+        _fail(task, "ended", "the same value for a row alone", "another")
 
 
 def _check_score(task: Task, played: Played) -> None:
@@ -252,13 +252,13 @@ def _check_acting(agent: Agent, task: Task, learner: Learner) -> None:
 
         whole = act(slice(None))
         if not np.array_equal(whole, act(slice(None))):
-            _fail(actor, "act", "the same of the same generators", "other actions")
+            _fail(actor, "act", "the same actions from the same generators", "other actions")
         if not np.allclose(whole[1:2], act(slice(1, 2)), atol=CLOSE):
-            _fail(actor, "act", "an action that hangs on no other row", "another one alone")
+            _fail(actor, "act", "an action that does not depend on other rows", "another one alone")
 
 
 def _check_round_trip(agent: Agent, task: Task, learner: Learner, device: str) -> None:
-    """A learner with the state and memory of another one goes on as that one does."""
+    """Check that a learner with the state and memory of another one makes the same updates."""
     state, memory = _copied(learner.state()), _copied(learner.memory())
     other = agent.learner(task, 1, device)
     other.load_state(state)
@@ -267,16 +267,16 @@ def _check_round_trip(agent: Agent, task: Task, learner: Learner, device: str) -
     for _ in range(2):
         numbers, found = learner.update(0.0, first), other.update(0.0, second)
         if numbers != found:
-            _fail(other, "load_state", f"the numbers of one that never stopped, {numbers}", found)
+            _fail(other, "load_state", f"the numbers of an unstopped learner, {numbers}", found)
     for name, array in learner.state().items():
         if not np.array_equal(array, other.state()[name]):
-            _fail(other, "load_state", f"'{name}' as of one that never stopped", "another one")
+            _fail(other, "load_state", f"'{name}' of an unstopped learner", "another one")
     if other.kept != learner.kept:
         _fail(other, "load_memory", f"{learner.kept} kept", other.kept)
 
 
 def _check_refusals(agent: Agent, task: Task, learner: Learner, device: str) -> None:
-    """What is not whole, or of other shapes, is refused."""
+    """Check that incomplete states, and arrays of other shapes, are refused."""
     other = agent.learner(task, 1, device)
     methods = {"load_state": other.load_state, "load_memory": other.load_memory}
     for (method, load), whole in zip(
@@ -307,7 +307,7 @@ def _checked_actions(
 
 
 def _random(task: Task) -> Act:
-    """Actions of generators of their own, so that those of the episodes stay as they are."""
+    """Random actions from separate generators, so that those of the episodes do not change."""
     rng: dict[int, np.random.Generator] = {}
 
     def act(seen: Arrays, past: History, generators: Generators) -> Singles:  # noqa: ARG001
@@ -336,7 +336,7 @@ def _check_json(owner: object, identity: Any) -> None:
     try:
         json.dumps(identity)
     except (TypeError, ValueError) as error:
-        _fail(owner, "identity", "what JSON can hold", error)
+        _fail(owner, "identity", "values that JSON can hold", error)
 
 
 def _fail(owner: object, method: str, wanted: object, came: object) -> NoReturn:

@@ -1,13 +1,13 @@
-"""Errors that are told without a traceback.
+"""Errors that are shown without a traceback.
 
-Command lines print them as one line, so each message names the value, the bound and what to do. The
-status says whose fault it was: 2 the user's, who must change something, 75 the environment's.
+Commands print an error as one line, so each message names the value, the bound and a remedy. The
+exit status tells the cause: 2 is the user's input, 75 is the environment.
 """
 
 import os
 from errno import EADDRINUSE, EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS, ESTALE
 
-# What reading a file raises that anybody may have written: it is missing, no JSON, or another one.
+# Errors of reading a file from anybody: it may be missing, not JSON, or have another content.
 UNREADABLE = (
     OSError,
     ValueError,
@@ -18,7 +18,7 @@ UNREADABLE = (
     RecursionError,
 )
 USAGE_STATUS, UNAVAILABLE_STATUS = 2, os.EX_TEMPFAIL
-# A disk that is full or fails, no memory, no open files, a port that another process has.
+# A disk that is full or fails, no memory, too many open files, a port in use.
 PASSING = (ENOSPC, EDQUOT, EIO, EROFS, ESTALE, ENOMEM, EMFILE, ENFILE, EADDRINUSE)
 
 
@@ -31,11 +31,11 @@ class ConfigError(TangramError):
 
 
 class OwnCodeError(ConfigError):
-    """Code of the user's own fails, whatever it says of the environment."""
+    """The user's own code fails; the status is 2 even for an error of the environment."""
 
 
 class UnavailableError(TangramError):
-    """What the environment lacks, and may have again by itself: it helps to try again later."""
+    """The environment lacks something for now, such as disk space: try again later."""
 
 
 class SamplingError(TangramError):
@@ -51,7 +51,7 @@ class WireError(TangramError):
 
 
 def is_passing(error: BaseException | None) -> bool:
-    """Whether an error, or the one that it was made of, is the environment's."""
+    """Whether the environment caused an error, directly or through the error's cause."""
     seen = set[int]()
     while error is not None and id(error) not in seen and not isinstance(error, OwnCodeError):
         seen.add(id(error))

@@ -1,8 +1,7 @@
-"""Tasks and agents by their names: those that come with the package, and those of others.
+"""Tasks and agents by name: from tangram-rl, from other packages and from files.
 
-Another package announces its own as entry points of the groups `tangram_rl.tasks` and
-`tangram_rl.agents`. One in a file is named path/to/file.py:Name, and is known once `load_own` has
-loaded it.
+Another package announces its tasks and agents as entry points of the groups `tangram_rl.tasks` and
+`tangram_rl.agents`. A class in a file is named path/to/file.py:Name; `load_own` must load it first.
 """
 
 from collections.abc import Mapping
@@ -15,13 +14,13 @@ from tangram_core.errors import ConfigError
 from tangram_core.run.code import KIND, load_code, own_code, read_code, where
 from tangram_core.settings import Settings
 
-if TYPE_CHECKING:  # a command line that is wrong need not wait for numpy
+if TYPE_CHECKING:  # a wrong command line fails without loading numpy
     from tangram_core.agent import Agent
     from tangram_core.task import Task
 
 Role = Literal["task", "agent"]
 TASK, AGENT = "task", "agent"  # the sections that every run has
-SHA256 = "sha256"  # of the file that it stands in, beside its name
+SHA256 = "sha256"  # setting beside `kind`: digest of the file
 OURS: dict[Role, dict[str, str]] = {
     "task": {
         "place": "tangram_tasks.place:Place",
@@ -40,45 +39,45 @@ OURS: dict[Role, dict[str, str]] = {
 
 
 class Own(NamedTuple):
-    """A class of a user's file."""
+    """A task or an agent from a user's file."""
 
     kind: type[Any]
-    named: str  # the whole path, and its name
+    named: str  # absolute/path/to/file.py:Name
     sha256: str
 
 
-_own: dict[tuple[Role, str], Own] = {}  # role, whole path and name, or the name alone
+_own: dict[tuple[Role, str], Own] = {}  # role, and path:Name or Name
 
 
 def find_task(kind: str) -> "type[Task]":
     """The class of a task.
 
     Raises:
-        ConfigError: there is none of this name, it is no task, or it stands in a file that nobody
-            named.
+        ConfigError: there is no such task, the class is no task, or its file was not named on the
+            command line.
     """
     return _own_of("task", kind).kind if own_code(kind) else _found("task", kind)
 
 
 def find_agent(kind: str) -> "type[Agent]":
-    """The class of an agent; errors as for `find_task`."""
+    """The class of an agent; errors as in `find_task`."""
     return _own_of("agent", kind).kind if own_code(kind) else _found("agent", kind)
 
 
 def announced(role: Role) -> dict[str, str]:
-    """The tasks or agents of other packages: name -> module:Class."""
+    """Tasks or agents of other packages: name -> module:Class."""
     return {one.name: one.value for one in entry_points(group=f"tangram_rl.{role}s")}
 
 
 def load_own(role: Role, given: str) -> None:
-    """Load a task or an agent that a command line, or a program, names in a file.
+    """Load a task or an agent from a file that a command line or a program names.
 
     Args:
-        role: which.
+        role: task or agent.
         given: path/to/file.py:Name.
 
     Raises:
-        ConfigError: it cannot be loaded, or is none.
+        ConfigError: the class cannot be loaded, or is no task or agent.
     """
     own = own_code(given)
     if own is None:
@@ -91,10 +90,10 @@ def load_own(role: Role, given: str) -> None:
 
 
 def named(role: Role, kind: str) -> dict[str, str]:
-    """A kind as a config has it; of one in a file the whole path and the file's content.
+    """The settings that name a kind; for one in a file the absolute path and the file's digest.
 
     Raises:
-        ConfigError: it stands in a file that nobody named.
+        ConfigError: the file was not named on the command line.
     """
     if own_code(kind) is None:
         return {KIND: kind}
@@ -103,13 +102,13 @@ def named(role: Role, kind: str) -> dict[str, str]:
 
 
 def identity(role: Role, kind: str) -> dict[str, str]:
-    """What processes on different machines compare of a kind: not where its file lies."""
+    """As `named`, without the path of the file, to compare processes on different machines."""
     said = named(role, kind)
     return said | {KIND: said[KIND].rpartition(":")[2]} if SHA256 in said else said
 
 
 def _own_of(role: Role, kind: str) -> Own:
-    """By its path, or where that is another one on this machine, by its name."""
+    """The loaded class by path, or by name if the path differs on this machine."""
     path, name = own_code(kind) or (Path(), "")
     found = _own.get((role, f"{path.absolute()}:{name}"), _own.get((role, name)))
     if found is None:
@@ -139,7 +138,7 @@ def _found(role: Role, kind: str) -> type[Any]:
 
 
 def _checked(what: str, role: Role, found: object) -> type[Any]:
-    """Refuse what cannot be made of settings; see the docstrings of `Task` and `Agent`."""
+    """The class, if it can be made from settings; see the docstrings of `Task` and `Agent`."""
     from tangram_core.agent import Agent  # noqa: PLC0415 - a wrong command line needs no numpy
     from tangram_core.task import Task  # noqa: PLC0415
 
@@ -162,5 +161,5 @@ def _checked(what: str, role: Role, found: object) -> type[Any]:
             raise ConfigError(f"{what}: {section.__name__} must not declare {KIND} or {SHA256}")
         attribute = "config" if name == role else name
         if attribute not in held:
-            raise ConfigError(f"{what} has no field {attribute}: declare it, in a @dataclass")
+            raise ConfigError(f"{what} has no field {attribute}: declare it in a @dataclass")
     return found

@@ -1,4 +1,4 @@
-"""Scores: what they are called, how people read them, and how a file or a message names them."""
+"""Scores of a task: names, labels, formats, and their JSON form."""
 
 import json
 import re
@@ -10,19 +10,19 @@ from tangram_core.errors import ConfigError
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
 MAX_LABEL, MAX_UNIT, MAX_DIGITS = 40, 8, 9
-SHOWN = 4  # where there is little room
-COUNTS = ("episodes", "seconds")  # what every evaluation tells beside its scores
+SHOWN = 4  # scores in a short line
+COUNTS = ("episodes", "seconds")  # numbers that every evaluation reports beside its scores
 
 
 @dataclass(frozen=True)
 class Score:
-    """A number by which play is judged, as people are shown it.
+    """Name and format of a number that measures how well a task was played.
 
     Attributes:
-        name: in result.json, in TensorBoard and in files of scores.
-        label: a few words.
-        digits: after the point.
-        unit: written behind the number.
+        name: key in result.json, TensorBoard and files of scores.
+        label: a few words for people.
+        digits: digits after the decimal point.
+        unit: text behind the number.
     """
 
     name: str
@@ -44,21 +44,21 @@ class Score:
             )
 
     def shown(self, value: float | None) -> str:
-        """The number as people read it."""
+        """The value as text with its unit; - for None."""
         return "-" if value is None else f"{value:.{self.digits}f}{self.unit}"
 
     def told(self, value: float) -> str:
-        """With its label."""
+        """The label and the value as text."""
         return f"{self.label} {self.shown(value)}"
 
 
 def written(scores: Iterable[Score]) -> list[list[Any]]:
-    """Scores as JSON has them."""
+    """Scores as a JSON list."""
     return [list(astuple(score)) for score in scores]
 
 
 def read(content: Any) -> tuple[Score, ...]:
-    """Scores from JSON, or from a text of it; none where it is nothing of the kind."""
+    """Scores from a JSON list or its text; empty if the content is anything else."""
     try:
         rows = json.loads(content) if isinstance(content, str) else content
         return tuple(Score(*row) for row in rows)
@@ -67,6 +67,6 @@ def read(content: Any) -> tuple[Score, ...]:
 
 
 def told(scores: Sequence[Score], values: Mapping[str, float], before: str = "") -> str:
-    """Those that there are values of, by names with something before them, in one line."""
+    """The scores that have a value in one line; the keys of values are `before` + name."""
     known = [score for score in scores if before + score.name in values]
     return ", ".join(score.told(values[before + score.name]) for score in known)

@@ -1,4 +1,4 @@
-"""Generators for every place that needs randomness, derived so that no two share a stream."""
+"""Random generators for episodes, derived so that no two episodes share a stream."""
 
 import hashlib
 
@@ -10,14 +10,14 @@ def episode_generator(
 ) -> np.random.Generator:
     """The generator of one episode.
 
-    Any two different tuples of arguments give independent streams, so workers never play the same
-    episodes, and a worker that is started again (a new incarnation) does not repeat itself.
+    Different arguments give independent streams. So workers never play the same episodes, and a
+    worker that is started again (a new incarnation) does not repeat its episodes.
 
     Args:
         run_seed: seed of the whole run.
-        role: who plays, such as `player`.
-        index: which one of that role.
-        incarnation: how often that one was started.
+        role: role of the process, such as `player`.
+        index: number of the process within its role.
+        incarnation: how often this process was started.
         episode: number of the episode in this incarnation.
     """
     # SeedSequence joins and pads its integers, so (1,) and (1, 0) collide; a digest does not.

@@ -1,12 +1,12 @@
-"""How settings are declared: once, beside their owner, with default, bounds, unit and help.
+"""Declaration of settings: once, beside the code that uses them, with bounds, unit and help.
 
     @dataclass(frozen=True)
     class NoiseConfig(Settings, section="noise"):
         kind: str = setting("none", "which noise", choices=("none", "gaussian"))
         width: float = setting(0.1, "its deviation", low=0, unit="arena", only={"kind": "gaussian"})
 
-A dataclass of settings checks each value when it is made. What `--help` and docs/settings.md say
-of a setting is what stands here.
+A dataclass of settings checks each value when it is created. `--help` and docs/settings.md are made
+from these declarations.
 """
 
 import math
@@ -22,28 +22,28 @@ from tangram_core.errors import ConfigError
 Value = TypeVar("Value")
 Metadata = Mapping[str, "Declaration"]
 KEY = "setting"
-# What a setting is a part of: see `Declaration.part`.
+# Values of `Declaration.part`.
 PLAY, NETWORK, LEARNING = "play", "network", "learning"
 MAX_NAME = 255  # bytes, on Linux
-MAX_PATH = 3840  # bytes: Linux takes 4096, and what is made in a folder needs the rest
+MAX_PATH = 3840  # bytes: Linux takes 4096, and paths inside the folder need the rest
 MAX_SHOWN = 40
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """What is said of a setting besides its type and default.
+    """Help, bounds, unit and conditions of a setting.
 
     Attributes:
         help: one line.
-        low, high: bounds of the number, or of each number of a list; None: it has none.
-        choices: that a text must be one of; empty: any text.
-        unit: of the number, in the words of docs/settings.md; empty: it has none.
-        only: other settings of the same section -> the value, or the tuple of values, under which
-            this one has an effect. What is not the default is refused under any other.
-        unless: the same the other way round: the values under which this one has none.
-        part: of a run: PLAY may be another when a trained run plays, NETWORK is what its weights
-            were trained for, and LEARNING is over by then.
+        low, high: bounds of the number, or of each number of a list; low=None: no bounds.
+        choices: allowed texts; empty: any text.
+        unit: unit of the number, as in docs/settings.md; empty: none.
+        only: another setting of the section -> the value, or a tuple of values, that it must have
+            for this setting to have an effect. Otherwise only the default is accepted.
+        unless: the opposite of `only`: values with which this setting has no effect.
+        part: PLAY: may change when a trained run plays; NETWORK: fixed by the trained weights;
+            LEARNING: used in training only.
     """
 
     help: str
@@ -57,7 +57,7 @@ class Declaration:
 
 
 def setting(default: Value, help: str, **more: Any) -> Value:  # noqa: A002
-    """A field of a dataclass of settings; `more` are the attributes of `Declaration`."""
+    """A field of a `Settings` dataclass; `more` are attributes of `Declaration`."""
     return field(default=default, metadata=declared(help, **more))
 
 
@@ -67,20 +67,20 @@ def declared(help: str, **more: Any) -> Metadata:  # noqa: A002
 
 
 class Settings:
-    """Base of frozen dataclasses of settings: each value is checked at birth.
+    """Base of frozen dataclasses of settings; each value is checked when one is created.
 
     Attributes:
-        section: under which its settings stand in a config; empty: they stand at the top.
+        section: name of the section in a config; empty: the top level.
     """
 
     section: ClassVar[str] = ""
 
     def __init_subclass__(cls, section: str = "") -> None:
-        """Name the section of a class."""
+        """Set the section of a subclass."""
         cls.section = section
 
     def __post_init__(self) -> None:
-        """Check each setting; ConfigError names it, its value and its bound or choices."""
+        """Check each setting; ConfigError names the setting, its value and the bound or choices."""
         for own in declared_fields(type(self)):
             _check(setting_name(self, own.name), getattr(self, own.name), own.metadata[KEY])
         for own in declared_fields(type(self)):
@@ -101,35 +101,35 @@ class Settings:
 
 
 def refuse_ignored(given: str, because: str, remedy: str, default: object = None) -> None:
-    """Raise ConfigError for a setting that would change nothing.
+    """Raise ConfigError for a setting that has no effect.
 
     Args:
-        given: the setting with its value.
-        because: the setting with its value that makes it so.
-        remedy: besides leaving the setting out.
-        default: of the setting, which a preset may have changed.
+        given: the setting, as name=value.
+        because: the setting that makes `given` useless, as name=value.
+        remedy: another remedy besides leaving `given` out.
+        default: default of the setting, which a preset may have changed.
     """
     left = "out" if default in (None, "") else f"at {told(default)}"
     raise ConfigError(f"{given} changes nothing with {because}: leave it {left}, or {remedy}")
 
 
 def declared_fields(kind: type[Any]) -> list["Field[Any]"]:
-    """The fields of a dataclass that are settings; groups within it are not."""
+    """The fields of a dataclass that are declared with `setting` or `declared`."""
     return [own for own in fields(kind) if KEY in own.metadata]
 
 
 def setting_name(owner: Settings | type[Settings], name: str) -> str:
-    """A setting's name as it is written on a command line."""
+    """The full name of a setting, as on a command line."""
     return f"{owner.section}.{name}" if owner.section else name
 
 
 def values_of(needed: object) -> tuple[object, ...]:
-    """The values that a condition of `Declaration.only` names, one or several."""
+    """The values of a condition of `Declaration.only` as a tuple."""
     return needed if isinstance(needed, tuple) else (needed,)
 
 
 def told(value: object) -> str:
-    """A value as it is written on a command line."""
+    """A value as text, as on a command line."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     if isinstance(value, tuple | list):
@@ -139,7 +139,7 @@ def told(value: object) -> str:
 
 def _check(name: str, value: object, what: Declaration) -> None:
     if value is None:
-        return  # where None is no value the type says so
+        return  # the type says whether None is allowed
     for one in value if isinstance(value, tuple) else (value,):
         if what.choices:
             check_choice(name, cast("str", one), what.choices)
@@ -149,7 +149,7 @@ def _check(name: str, value: object, what: Declaration) -> None:
 
 def check_range(name: str, value: Any, low: float, high: float = math.inf) -> None:
     """Raise ConfigError unless value is a finite number and low <= value <= high."""
-    # An integer may be too large for a float, too.
+    # An integer may be too large for a float.
     number = isinstance(value, Real) and not isinstance(value, bool)
     number = number and abs(value) <= sys.float_info.max
     if not (number and low <= value <= high):
@@ -159,7 +159,7 @@ def check_range(name: str, value: Any, low: float, high: float = math.inf) -> No
 
 
 def check_folder(name: str, value: str) -> None:
-    """Raise ConfigError unless the value can name a folder in which more is made."""
+    """Raise ConfigError unless the value can be the path of a folder for files and folders."""
     if not value.strip():
         raise ConfigError(f"{name} must name a folder, got '{value}': set {name}=runs/my_run")
     data = value.encode(errors="surrogateescape")

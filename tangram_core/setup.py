@@ -1,4 +1,4 @@
-"""What a master and its workers must agree on: a task and an agent, from plain mappings."""
+"""The task and the agent of a run, made from a config; master and workers compare them."""
 
 import hashlib
 import json
@@ -33,8 +33,8 @@ class Setup:
     """The task and the agent of one run.
 
     Attributes:
-        task, agent: the two.
-        task_kind, agent_kind: the names that they go by.
+        task, agent: the task and the agent.
+        task_kind, agent_kind: their names in `task.kind` and `agent.kind`.
     """
 
     task: Task
@@ -48,33 +48,33 @@ class Setup:
 
     @property
     def spec(self) -> EpisodeSpec:
-        """What its episodes are made of."""
+        """Names, shapes and bounds of the arrays in an episode of the task."""
         return self.task.spec
 
     @property
     def kinds(self) -> dict[str, dict[str, str]]:
-        """How the two are named in a config; by its content too, what stands in a file."""
+        """Section -> the settings that name the task or the agent; see `named`."""
         return {TASK: named("task", self.task_kind), AGENT: named("agent", self.agent_kind)}
 
     @property
     def sections(self) -> dict[str, Settings | None]:
-        """Section of the settings -> what it holds; nothing where it only names the kind."""
+        """Section -> its settings; None if the section only names the kind."""
         own = {TASK: None, AGENT: None}
         return own | _sections(self.task) | _sections(self.agent)
 
     def config(self) -> dict[str, Any]:
-        """The sections of a config that makes this setup."""
+        """The sections of a config from which `make_setup` makes this setup."""
         held = {
             n: {} if one is None else asdict(cast("Any", one)) for n, one in self.sections.items()
         }
         return {name: self.kinds.get(name, {}) | held[name] for name in held}
 
     def fingerprints(self) -> dict[str, str]:
-        """A digest of each section: two processes with the same ones play the same task."""
+        """Section -> digest; processes with equal digests have the same task and agent."""
         return {name: _digest(content) for name, content in self.contents().items()}
 
     def task_digest(self) -> str:
-        """A digest of all sections but the agent's, which may change in the middle of a run."""
+        """A digest of all sections except the agent's, which may change during a run."""
         digests = [value for name, value in sorted(self.fingerprints().items()) if name != AGENT]
         return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
 
@@ -87,19 +87,22 @@ class Setup:
         return plain
 
     def differences(self, contents: object) -> list[str]:
-        """The sections in which another setup, known by its contents, is not this one.
+        """Names of the sections that differ from those of another setup.
 
-        Only settings that both know are compared, so that a run outlives a version with more of
-        them: what is new does by default what was done before.
+        Only settings that both setups have are compared. So a run can go on with a newer version,
+        whose new settings have defaults that change nothing.
+
+        Args:
+            contents: `contents()` of the other setup, for example from a checkpoint.
         """
         own = self.contents()
         known = own | contents if isinstance(contents, dict) else {}
         return sorted(name for name in own if not _agree(own[name], known.get(name)))
 
     def meant_otherwise(self, contents: object, section: str = AGENT) -> list[str]:
-        """The settings by which networks of another setup are not networks of this one.
+        """Names of the settings that make the networks of another setup unusable in this one.
 
-        They may have the same shapes: what they see, give and learn from is another thing.
+        The shapes may be equal, but inputs, outputs or the learned values have another meaning.
         """
         other = contents.get(section) if isinstance(contents, dict) else None
         own, holds = self.contents().get(section, {}), self.sections.get(section)
@@ -111,7 +114,7 @@ class Setup:
 
 
 def attribute(section: str) -> str:
-    """The field of a task or agent that holds a section: `config` is the one of its role."""
+    """The field of a task or an agent that holds a section: `config` for task and agent."""
     return "config" if section in (TASK, AGENT) else section
 
 
@@ -133,17 +136,17 @@ def _agree(one: object, other: object) -> bool:
 
 
 def section_names(config: Mapping[str, Any]) -> tuple[str, ...]:
-    """The sections of a resolved config that make its setup.
+    """Names of the sections in a resolved config that its task and agent need.
 
     Raises:
-        ConfigError: it names no task or agent, or one that there is not.
+        ConfigError: the config names no task or agent, or an unknown one.
     """
     task, agent = find_task(_kind(config, TASK)), find_agent(_kind(config, AGENT))
     return tuple(dict.fromkeys((TASK, *task.sections, AGENT, *agent.sections)))
 
 
 def make_setup(config: Mapping[str, Any]) -> Setup:
-    """The setup in the sections of a resolved config.
+    """Make the setup of a resolved config.
 
     Raises:
         ConfigError: a section is missing, a key is unknown, or a value has a wrong type or range.
@@ -161,21 +164,21 @@ def _kind(config: Mapping[str, Any], role: str) -> str:
     kind = section.get(KIND) if isinstance(section, Mapping) else None
     if not isinstance(kind, str):
         raise ConfigError(
-            f"the config names no {role}: it must have {role}.{KIND}; a config may lack it of an "
-            "older version (CHANGELOG.md)"
+            f"the config names no {role}: it must have {role}.{KIND}; a config of an older version "
+            "may lack it (CHANGELOG.md)"
         )
     return kind
 
 
 def _made(kind: type[Made], config: Mapping[str, Any], role: Role) -> Made:
-    """A task or an agent of its sections."""
+    """A task or an agent from its sections."""
     sections: Mapping[str, type[Settings]] = kind.sections  # type: ignore[attr-defined]
     said = named(role, config[role][KIND])
     wanted = config[role].get(SHA256)
     if SHA256 in said and wanted not in (None, said[SHA256]):
         raise ConfigError(
             f"{role}={said[KIND]}: the file has sha256 {said[SHA256]}, and the settings of "
-            f"the run want {wanted}: name the file that it began with, or begin a new run"
+            f"the run want {wanted}: name the file that the run began with, or begin a new run"
         )
     own = {name: value for name, value in config[role].items() if name not in said}
     if role not in sections and own:
@@ -185,15 +188,15 @@ def _made(kind: type[Made], config: Mapping[str, Any], role: Role) -> Made:
 
 
 def from_mapping(kind: type[Made], mapping: Mapping[str, Any], section: str = "") -> Made:
-    """A settings dataclass from a plain mapping; unknown keys and wrong types are refused.
+    """Make a settings dataclass from a plain mapping.
 
     Args:
         kind: the dataclass.
         mapping: name -> value.
-        section: that it stands in, for errors.
+        section: name of the section, for errors.
 
     Raises:
-        ConfigError: names the key and what is wrong with it.
+        ConfigError: a key is unknown or a value has a wrong type; names the key.
     """
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"the section {section} must be a mapping, got {mapping!r}")
@@ -213,7 +216,7 @@ def from_mapping(kind: type[Made], mapping: Mapping[str, Any], section: str = ""
 
 
 def _wanted(kind: Any) -> str:
-    """A type in plain words."""
+    """The name of a type in plain words."""
     if get_origin(kind) is tuple:
         return f"a list, each {_wanted(get_args(kind)[0])}"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
@@ -221,16 +224,16 @@ def _wanted(kind: Any) -> str:
 
 
 def _check_names(kind: type[Any], mapping: Mapping[str, Any], group: str) -> None:
-    """Refuse unknown names, and what is no list where one is expected.
+    """Refuse unknown names, and a text or number where a list is expected.
 
-    A text would be taken letter by letter.
+    A text would become a list of its letters.
     """
     hints = get_type_hints(kind)
     for name, value in mapping.items():
         if name not in hints:
             raise ConfigError(
-                f"there is no setting {group}{name}: delete it; CHANGELOG.md says what became of "
-                "one of an older version"
+                f"there is no setting {group}{name}: delete it; CHANGELOG.md tells what replaces "
+                "settings of older versions"
             )
         if get_origin(hints[name]) is tuple and not isinstance(value, list | tuple):
             full = f"{group}{name}"
@@ -240,7 +243,7 @@ def _check_names(kind: type[Any], mapping: Mapping[str, Any], group: str) -> Non
 
 
 def _as_float(value: object) -> object:
-    """Whole numbers are welcome where a float is expected; texts and booleans are not."""
+    """An integer as a float where a float is expected; other values are returned unchanged."""
     if isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     return value

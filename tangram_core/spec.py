@@ -1,4 +1,4 @@
-"""What an episode is made of: named arrays with their types, shapes and bounds.
+"""The arrays of an episode: names, types, shapes and bounds.
 
 Legend: E episodes, B environments that play in step, T steps of an episode, A entries of an action.
 """
@@ -20,22 +20,22 @@ Arrays = Mapping[str, Array]
 Per = Literal["moment", "step", "episode"]
 
 ACTIONS, REWARDS, TERMINATED = "actions", "rewards", "terminated"
-OWN = (ACTIONS, REWARDS, TERMINATED)  # names that every task has
+OWN = (ACTIONS, REWARDS, TERMINATED)  # arrays that every task has
 DTYPES = ("f4", "u1")
 MAX_REWARD = 1e6
 
 
 @dataclass(frozen=True)
 class Field:
-    """One of the arrays that an episode consists of.
+    """Declaration of one array of an episode.
 
     Attributes:
-        name: in the arrays of an episode, and in front of every reason why one is refused.
-        shape: of one row: of what there is at one moment, of one step, or of one episode.
-        low, high: bounds of every value. They are checked, never clipped to: choose them so wide
-            that only what is wrong lies beyond.
+        name: name of the array in an episode and in errors.
+        shape: shape of one row: at one moment, in one step, or for a whole episode.
+        low, high: bounds of every value. A value outside is an error, it is not clipped: choose
+            bounds that only wrong values break.
         per: moment: T + 1 rows, before each step and after the last; step: T rows; episode: one.
-        dtype: f4 for numbers, u1 for flags and pixels.
+        dtype: f4 (float32) for numbers, u1 (uint8) for flags and pixels.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Field:
         if not self.low < self.high or not math.isfinite(self.low) or not math.isfinite(self.high):
             raise ConfigError(
                 f"field {self.name}: its bounds must be finite, the lower one first, got "
-                f"{self.low:g} and {self.high:g}: give bounds that only what is wrong breaks"
+                f"{self.low:g} and {self.high:g}: give bounds that only wrong values break"
             )
         if self.dtype not in DTYPES:
             raise ConfigError(
@@ -59,22 +59,23 @@ class Field:
             raise ConfigError(f"field {self.name}: its shape has an empty side, {self.shape}")
 
     def rows(self, horizon: int) -> tuple[int, ...]:
-        """The shape of one whole episode of so many steps."""
+        """The shape of the array in an episode of `horizon` steps."""
         before = {"moment": (horizon + 1,), "step": (horizon,), "episode": ()}[self.per]
         return (*before, *self.shape)
 
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """What the episodes of a task are made of.
+    """Names, shapes and bounds of the arrays in an episode of a task.
 
     Attributes:
-        horizon: T, steps of every episode. What ends early plays on, and is marked `terminated`.
+        horizon: T, steps of every episode. An episode that ends early is marked `terminated` and
+            plays on to T.
         action_size: A; every entry of an action lies in [-1, 1].
-        fields: what is observed.
-        achieved: name of the field, one of each moment, that a goal is compared with.
-        desired: name of the field, one of each episode, that is the goal that was played for.
-        rewards: the least and the largest reward there can be.
+        fields: the observed arrays.
+        achieved: name of the field with the achieved goal; it has one row for each moment.
+        desired: name of the field with the desired goal; it has one row for each episode.
+        rewards: least and largest possible reward.
     """
 
     horizon: int
@@ -97,7 +98,7 @@ class EpisodeSpec:
 
     @cached_property
     def every(self) -> tuple[Field, ...]:
-        """All fields, in the order in which they travel: what is observed, then `OWN`."""
+        """All fields in the order of a message: the observed ones, then those of `OWN`."""
         return (
             *self.fields,
             Field(ACTIONS, (self.action_size,), -1.0, 1.0, "step"),
@@ -106,11 +107,11 @@ class EpisodeSpec:
         )
 
     def field(self, name: str) -> Field:
-        """The field of this name."""
+        """The field called `name`."""
         return next(field for field in self.every if field.name == name)
 
     def empty(self, count: int) -> "Episodes":
-        """Room for so many episodes."""
+        """Episodes filled with zeros, `count` of them."""
         shapes = {field.name: (count, *field.rows(self.horizon)) for field in self.every}
         return Episodes(
             {field.name: np.zeros(shapes[field.name], field.dtype) for field in self.every}
@@ -119,10 +120,10 @@ class EpisodeSpec:
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
-    """Whole episodes of equal length, as they were played: what a worker sends.
+    """Whole episodes of equal length, as a worker plays and sends them.
 
     Attributes:
-        arrays: by the names of an `EpisodeSpec`, each (E, rows of a moment, step or episode, ...).
+        arrays: field name -> array (E, T + 1, ...), (E, T, ...) or (E, ...), see `Field.per`.
     """
 
     arrays: Arrays
@@ -132,40 +133,40 @@ class Episodes:
 
     @property
     def actions(self) -> Singles:
-        """(E, T, A) float32 in [-1, 1]."""
+        """Actions (E, T, A) float32 in [-1, 1]."""
         return self.arrays[ACTIONS]
 
     @property
     def rewards(self) -> Singles:
-        """(E, T) float32 of the goal that was played for."""
+        """Rewards (E, T) float32 for the desired goal."""
         return self.arrays[REWARDS]
 
     @property
     def terminated(self) -> npt.NDArray[np.uint8]:
-        """(E, T) 1 where nothing that follows the step counts; a time limit is not marked."""
+        """Flags (E, T): 1 if the task ended with the step; 0 at a time limit."""
         return self.arrays[TERMINATED]
 
     @property
     def count(self) -> int:
-        """E."""
+        """E, the number of episodes."""
         return len(self.actions)
 
     @property
     def steps(self) -> int:
-        """T."""
+        """T, the steps of an episode."""
         return int(self.actions.shape[1])
 
     @property
     def transitions(self) -> int:
-        """E * T."""
+        """E * T, the number of transitions."""
         return self.count * self.steps
 
     def at(self, rows: Any) -> "Episodes":
-        """The episodes at an index, a slice or where a mask is set."""
+        """The selected episodes; `rows`: an index array, a slice or a mask."""
         return Episodes({name: array[rows] for name, array in self.arrays.items()})
 
 
 def joined(parts: Iterable[Episodes]) -> Episodes:
-    """All episodes in one."""
+    """Concatenate episodes of equal length."""
     every = list(parts)
     return Episodes({n: np.concatenate([one[n] for one in every]) for n in every[0].arrays})

@@ -1,4 +1,4 @@
-"""The interface of a task: what is played, what it is worth, and how it is scored.
+"""The interface of a task: environments, rewards and scores.
 
 Legend: E episodes, B environments, T steps of an episode, A entries of an action, n goals.
 """
@@ -22,12 +22,12 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one step of B environments gave.
+    """The result of one step of B environments.
 
     Attributes:
-        seen: what is observed now: the task's fields, one row for each environment.
-        rewards: (B,) for the goal that is played for.
-        terminated: (B,) where nothing that follows counts.
+        seen: observations after the step: the task's fields, one row for each environment.
+        rewards: (B,) rewards for the desired goal.
+        terminated: (B,) true if the task ended with this step.
     """
 
     seen: Arrays
@@ -37,10 +37,10 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What was seen and done in B episodes so far, t steps in each.
+    """Observations and actions of the first t steps of B episodes.
 
     Attributes:
-        seen: fields of each moment, (B, t + 1, ...): before each step that was made, and now.
+        seen: fields of each moment, (B, t + 1, ...): before each of the t steps, and now.
         actions: (B, t, A).
     """
 
@@ -48,20 +48,19 @@ class History:
     actions: Singles
 
 
-# What the fields show now (B rows each), what was before, a generator for each environment ->
-# actions (B, A).
+# Present fields (B rows each), history, a generator for each environment -> actions (B, A).
 Chooser = Callable[[Arrays, History, Generators], Singles]
 
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """E whole episodes, and what only the environments know of them.
+    """E whole episodes, with facts of the environments that no agent sees.
 
     Attributes:
-        episodes: as the agent saw them.
-        facts: what `Env.facts` told, (E, T + 1, ...): after reset and after each step.
-        seconds: (E,) wall time of choosing and moving, an equal share for those played together.
-        chose: (E,) processor time of choosing, shared equally by those played together that go on.
+        episodes: the episodes as the agent saw them.
+        facts: results of `Env.facts`, (E, T + 1, ...): after reset and after each step.
+        seconds: (E,) wall time in s of choosing and stepping; episodes played together share it.
+        chose: (E,) processor time in s of choosing; unfinished episodes played together share it.
     """
 
     episodes: Episodes
@@ -71,13 +70,13 @@ class Played:
 
 
 class Env(ABC):
-    """B environments that play in step, in one process.
+    """B environments in one process that are stepped together.
 
-    All randomness of an episode comes from its own generator, so an episode does not depend on
-    those beside it. An episode always has `horizon` steps: one that terminates plays on.
+    All randomness of an episode comes from its own generator, so an episode does not depend on the
+    other environments. An episode always has `horizon` steps, also after it terminated.
 
     Attributes:
-        count: B.
+        count: B, the number of environments.
     """
 
     count: int
@@ -87,36 +86,36 @@ class Env(ABC):
         """Begin an episode in every environment.
 
         Args:
-            generators: B, one for each.
+            generators: B random generators, one for each environment.
 
         Returns:
-            What is observed: every field of the spec that is one of each moment or episode, (B,
-            *shape), of its dtype or a more exact one.
+            Observations: every field of the spec with one row for each moment or episode, (B,
+            *shape), in its dtype or a more exact one.
         """
 
     @abstractmethod
     def step(self, actions: Singles) -> Step:
-        """Play one action (B, A) of [-1, 1] in every environment."""
+        """Play one action in every environment; actions (B, A) lie in [-1, 1]."""
 
     def facts(self) -> Arrays:
-        """What scores are made of and no agent sees, (B, ...) each, now; the same names always."""
+        """Name -> current values (B, ...) for scores; no agent sees them. Names never change."""
         return {}
 
     def told(self) -> Json:
-        """What gymnasium's `info` has of the last step of the first environment."""
+        """Entries of gymnasium's `info` for the last step of the first environment."""
         return {}
 
     def picture(self, size: int) -> Pixels | None:  # noqa: ARG002
-        """The first environment as it is now, (size, size, 3); None: there is none."""
+        """A picture (size, size, 3) of the first environment now; None: there is none."""
         return None
 
     def close(self) -> None:  # noqa: B027
-        """Let go of what it holds; calling it twice does no harm."""
+        """Free all resources; a second call does nothing."""
 
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """What is played, by any number of workers, and what it is worth.
+    """A task: environments that any number of workers play, their rewards and scores.
 
     A task is a frozen dataclass whose fields are the sections of its settings:
 
@@ -129,75 +128,74 @@ class Task(ABC):
             sections: ClassVar = {"task": PointConfig}
             config: PointConfig = PointConfig()
 
-    The section of its role, `task`, is its `config`; others go by their names.
+    The field `config` holds the section `task`; other fields have the names of their sections.
 
-    The master makes one too, and so does whoever shows a run: to make a task loads no engine.
-    `make` does, and only a worker calls it. So nothing heavy is imported at the top of its file.
+    The master and the commands that show a run create tasks, too. So creating a task must not load
+    an engine, and the file must not import one at its top. Only `make` loads it, in a worker.
 
-    What must be there: `spec`, `scores`, `rewards`, `make` and `score`. What may: `check`,
+    A subclass must define `spec`, `scores`, `rewards`, `make` and `score`. It may define `check`,
     `check_exact`, `ended`, `rivals`, `draw`, `film` and `plan`.
 
-    **Goals.** Two fields of the spec hold goals of the same shape: what is achieved at each moment,
-    and what is desired in an episode. Hindsight asks `rewards` what the same step would have been
-    worth for any other goal, so it must be a function of both and nothing else. It is called with
-    thousands of rows at a time.
+    **Goals.** Two fields of the spec hold goals of the same shape: the achieved goal of each moment
+    and the desired goal of the episode. Hindsight calls `rewards` to get the reward of a step for
+    another goal, so `rewards` must depend on these two fields only. It is called with thousands of
+    rows at a time.
 
-    **Ends.** Every episode has `spec.horizon` steps. Where a task ends early (a place is reached,
-    something fell) the step is marked `terminated`, what follows does not count for it, and play
-    goes on. A time limit is no end.
+    **Ends.** Every episode has `spec.horizon` steps. If a task ends early (a place is reached,
+    something fell), the step is marked `terminated`. Play goes on, but later steps do not count for
+    this step. A time limit is no end.
 
-    **Scores.** `scores` declares what people are shown; the first one is the headline, by which
-    runs are compared. `score` computes them, of played test episodes. Beside a run `rivals` play
-    the same tests: what learned nothing, a formula, a rule or a planner; random actions, where a
-    task names no other.
+    **Scores.** `scores` declares the numbers that people are shown. The first one is the headline,
+    by which runs are compared. `score` computes them from played test episodes. `rivals` play the
+    same tests for comparison: a formula, a rule or a planner, by default random actions.
     """
 
     sections: ClassVar[Mapping[str, type[Settings]]] = {}
-    agent: ClassVar[str] = "goal"  # who learns it, where a command line names nobody: a preset
-    waits: ClassVar[str] = "none so far can be"  # what helps, where no episode can be learned from
+    agent: ClassVar[str] = "goal"  # preset of the default agent
+    waits: ClassVar[str] = "no episode so far can be used"  # shown until one can
     scores: ClassVar[tuple[Score, ...]] = ()
 
     @property
     @abstractmethod
     def spec(self) -> EpisodeSpec:
-        """What its episodes are made of; the same whenever it is asked."""
+        """Names, shapes and bounds of the arrays in an episode; the same at every call."""
 
     @abstractmethod
     def rewards(self, achieved: Array, desired: Array) -> Floats:
-        """(n,) what n steps are worth that came to `achieved` (n, ...), for goals (n, ...)."""
+        """Rewards (n,) of n steps that led to `achieved` (n, ...), for goals `desired` (n, ...)."""
 
     @abstractmethod
     def make(self, count: int, purpose: Purpose = "play") -> Env:
-        """So many environments; `test` also tells what scores need and play does not.
+        """Make `count` environments; with purpose `test` they also give the facts for scores.
 
         Raises:
-            ConfigError: a package that it needs is not installed, or settings that cannot work.
+            ConfigError: a package is not installed, or settings cannot work.
         """
 
     @abstractmethod
     def score(self, played: Played) -> dict[str, float]:
-        """The numbers that `scores` declares, of episodes that were made to test."""
+        """Name -> value of the scores that `scores` declares, from test episodes."""
 
     def ended(self, achieved: Array, desired: Array, recorded: Bools) -> Bools:  # noqa: ARG002
-        """(n,) whether n steps terminate for goals (n, ...), where `recorded` did for their own."""
+        """Flags (n,): whether n steps end the task for goals `desired`; `recorded`: as played."""
         return recorded
 
     def check(self, *, plays: bool) -> None:  # noqa: B027
-        """Refuse what cannot be played, or with plays=False learned from, on this machine.
+        """Refuse settings that cannot be played or, with plays=False, learned on this machine.
 
         Raises:
             ConfigError: names the setting and the remedy.
         """
 
     def check_exact(self) -> None:  # noqa: B027
-        """Refuse what plays an episode otherwise after another one: lockstep promises the same run.
+        """Refuse, for lockstep, settings with which an episode depends on the one before it.
 
         Raises:
             ConfigError: names the remedy.
         """
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """What learned nothing, by its name in tables, made for environments that it plays in."""
+        """Baselines without learning: name in tables -> maker of a `Chooser` for environments."""
         size = self.spec.action_size
 
         def uniform(_seen: Arrays, _past: History, generators: Generators) -> Singles:
@@ -207,25 +205,25 @@ class Task(ABC):
         return {"random": lambda _: uniform}
 
     def draw(self, played: Played) -> Pixels | None:  # noqa: ARG002
-        """A picture (H, W, 3) of a few test episodes; None: there is none to be drawn."""
+        """A picture (H, W, 3) of a few test episodes; None: the task draws none."""
         return None
 
     def film(self, played: Played) -> Iterable[Pixels] | None:  # noqa: ARG002
-        """Pictures (H, W, 3) of test episodes, one after the other; None: there are none."""
+        """Frames (H, W, 3) of an animation of test episodes; None: the task draws none."""
         return None
 
     def plan(self, played: Played) -> Json | None:  # noqa: ARG002
-        """The first test episode as data, for a machine that does the same; None: there is none."""
+        """The first test episode as data for a machine that repeats it; None: there is none."""
         return None
 
     def pinned(self) -> Self:
-        """With whatever code of the user's own it loads named by its content."""
+        """The same task, with the digest of each file of the user's own code in its settings."""
         return self
 
     def identity(self) -> Json:
-        """Section -> what it says: what master and workers must have alike to play one task."""
+        """Section -> its settings, which must be equal in master and workers."""
         return {n: asdict(getattr(self, "config" if n == "task" else n)) for n in self.sections}
 
     def facts(self) -> Json:
-        """What result.json tells of the task."""
+        """Facts about the task for result.json."""
         return {}

@@ -1,7 +1,7 @@
 """The commands tangram-eval, tangram-play and tangram-export.
 
-Everything heavy is imported after the config was composed, so --help and wrong input are
-instant.
+Heavy modules are imported after the settings are read, so that --help and refusals of wrong input
+are instant.
 """
 
 from pathlib import Path
@@ -40,7 +40,7 @@ def _evaluate(settings: Plain) -> int:
     if config.out is not None:
         check_writable("out", Path(config.out))
     _check_played(config)
-    tell(f"loads and plays {config.run}")
+    tell(f"loading and playing {config.run}")
 
     from tangram_game.evaluate import evaluate_run
 
@@ -70,7 +70,7 @@ def _play(settings: Plain) -> int:
 
         source = f"{name}={config.silhouette}"
         filled = read_silhouette(config.silhouette, source, stored.task)
-    tell(f"loads and plays {config.run}")
+    tell(f"loading and playing {config.run}")
     from tangram_game.play import play_run
 
     return play_run(config, filled)
@@ -83,14 +83,14 @@ def _export(settings: Plain) -> int:
 
     config = from_mapping(ExportConfig, with_changes(with_absolute_paths(settings)))
     check_writable("out", Path(config.out))
-    tell(f"writes {config.run_dir} down, for a minute, and plays it to compare")
+    tell(f"exporting {config.run_dir} and comparing it with torch: this takes a minute")
     from tangram_game.export import export_run
 
     return export_run(config)
 
 
 def _check_data(config: "PlayConfig", stored: "Run") -> None:
-    """Refuse data that nothing writes: a solution is one of a figure, a plan is of pushes."""
+    """Refuse .json and .svg that nothing writes: solutions need a figure, plans need pushes."""
     from tangram_core.errors import ConfigError
     from tangram_core.task import Task
 
@@ -98,16 +98,16 @@ def _check_data(config: "PlayConfig", stored: "Run") -> None:
     figure = config.target or config.silhouette
     if config.data and figure is None and not (plans and Path(config.out).suffix == ".json"):
         raise ConfigError(
-            f"out={config.out} is for where tokens lie in a figure, or a finger's way: name the "
-            "figure by target=cat or a file, or set run_dir=pretrained/hand out=plan.json"
+            f"out={config.out} is for positions of tokens in a figure, or a plan of pushes: name "
+            "the figure by target=cat or a file, or set run_dir=pretrained/hand out=plan.json"
         )
 
 
 def _recognised(config: "PlayConfig", stored: "Run") -> "PlayConfig | None":
-    """The settings with what `target` turns out to be; None where data were all that was asked for.
+    """The settings with the kind of `target` resolved; None if only data was to be written.
 
     Raises:
-        ConfigError: it cannot be used.
+        ConfigError: the target cannot be used.
     """
     from dataclasses import replace
 
@@ -120,13 +120,13 @@ def _recognised(config: "PlayConfig", stored: "Run") -> "PlayConfig | None":
         return config
     if not isinstance(stored.setup.task, Place):
         raise ConfigError(
-            f"{config.run} plays task={stored.setup.task_kind}, which takes figures of the library "
-            "alone: set puzzle=cat, or leave run_dir out"
+            f"{config.run} plays task={stored.setup.task_kind}, which takes only figures of the "
+            "library: set puzzle=cat, or leave run_dir out"
         )
     kind = targets.SILHOUETTE
     if config.target is not None:
         kind = targets.told_apart(figure, stored.task)
-        anew = ", and looked for here" if config.data and kind == targets.PUZZLE else ""
+        anew = ", which are searched anew" if config.data and kind == targets.PUZZLE else ""
         print(f"target={figure} is taken for {targets.TOLD[kind]}{anew}")
     if config.data:
         from tangram_core.store.files import write_whole
@@ -145,10 +145,10 @@ def _recognised(config: "PlayConfig", stored: "Run") -> "PlayConfig | None":
 
 
 def _with_figures(settings: Plain) -> Plain:
-    """Puzzles are a setting of a task of pushes.
+    """The settings, with `puzzle` moved to task.puzzle if the run plays task=push.
 
     Raises:
-        ConfigError: a file, or what says how puzzles of other tasks are shown.
+        ConfigError: a file or `turns` is given, which task=push does not take.
     """
     from tangram_agent.runs import read_changed
     from tangram_core.errors import ConfigError
@@ -163,18 +163,20 @@ def _with_figures(settings: Plain) -> Plain:
         return settings
     if settings["turns"] != 1 or Path(puzzle[0]).suffix:
         raise ConfigError(
-            "task=push makes figures of the library, at an angle of each episode: give names "
-            "alone, as in puzzle=cat or [cat,dog], without turns or file"
+            "task=push makes figures of the library at random angles: give only names, as in "
+            "puzzle=cat or [cat,dog], without turns or file"
         )
     own = changes.get("task", {})
     if "puzzle" in own:
-        raise ConfigError("puzzle= is task.puzzle= of such a run: leave one of both out")
+        raise ConfigError(
+            "puzzle= and task.puzzle= are one setting in task=push: leave one of both out"
+        )
     own = own | {"puzzle": list(puzzle)}
     return settings | {"puzzle": None, "changes": changes | {"task": own}}
 
 
 def _check_played(config: "EvalConfig | PlayConfig") -> "Run":
-    """Refuse what cannot be played before torch is loaded; returns what the run plays."""
+    """Refuse what cannot be played, before torch is loaded; returns the stored run."""
     from tangram_agent.runs import read_changed
 
     stored = read_changed(config.run, config.changes)
@@ -188,7 +190,7 @@ def _check_played(config: "EvalConfig | PlayConfig") -> "Run":
 
 
 def _check_drawings(config: "PlayConfig") -> None:
-    """Refuse a drawing that is not there before what reads drawings is loaded."""
+    """Refuse a missing file of a drawing before slow libraries are loaded."""
     from tangram_sim.puzzles.sketches import check_file
 
     for name, path in (("target", config.target), ("silhouette", config.silhouette)):
@@ -197,7 +199,7 @@ def _check_drawings(config: "PlayConfig") -> None:
 
 
 def with_changes(settings: Plain) -> Plain:
-    """The settings that are laid over a run's, in one mapping; null is as the run was trained."""
+    """The settings, with all that override the run's in a mapping `changes`; null: no override."""
     laid = {name: values for name, values in settings.items() if isinstance(values, dict)}
     given = {s: {n: v for n, v in own.items() if v is not None} for s, own in laid.items()}
     rest = {name: value for name, value in settings.items() if name not in laid}
@@ -205,9 +207,9 @@ def with_changes(settings: Plain) -> Plain:
 
 
 def with_absolute_paths(settings: Plain) -> Plain:
-    """Folders and files seen from where the command was started; what is no text is left alone.
+    """The settings with absolute paths of folders and files; values that are no text stay.
 
-    Puzzles and splits of the library stay names.
+    Names of puzzles and of splits of the library stay, too.
     """
     from tangram_game.config import check_puzzle, is_puzzle_source
     from tangram_sim.puzzles.figures import SPLITS
@@ -227,7 +229,7 @@ def with_absolute_paths(settings: Plain) -> Plain:
 
 
 def _absolute(value: object, is_run: bool) -> object:
-    """A path made absolute; `pretrained/<name>` stays a name unless a folder here is called so."""
+    """A path made absolute; `pretrained/<name>` stays a name unless such a folder exists here."""
     from tangram_agent.pretrained import is_name
 
     if not isinstance(value, str) or not value.strip():

@@ -1,4 +1,4 @@
-"""Settings of the tools that show what a run has learned: tangram-eval and tangram-play."""
+"""Settings of tangram-eval, tangram-play and tangram-export."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -12,12 +12,12 @@ from tangram_core.errors import ConfigError
 from tangram_core.settings import Settings, check_folder, refuse_ignored, setting, told
 from tangram_sim.puzzles.figures import SPLITS
 
-Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
-OF_TARGETS = ("targets", "mirrored")  # settings of sim that say nothing of a puzzle
+Changes = dict[str, dict[str, Any]]  # section -> setting -> value that overrides the run's
+OF_TARGETS = ("targets", "mirrored")  # settings of sim that concern random targets only
 MAX_EPISODES = 1_000_000
 MAX_SHOWN = 100
 MAX_TURNS = 360
-GAME = "tangram7"  # the agent that plays puzzles unless another is named
+GAME = "tangram7"  # the agent that plays puzzles by default
 ALL = ("all",)
 PICTURES = (".gif", ".mp4", ".png")
 DATA = (".json", ".svg")
@@ -25,19 +25,19 @@ WRITTEN = (*PICTURES, *DATA)
 MAX_SEED = 2**63 - 1
 PUZZLE_FILES = (".json", ".svg")
 PUZZLE_HELP = (
-    "instead of random targets: puzzles by name, as cat or [cat,dog], all of the library's train, "
-    "test or paper, or a JSON file of your own; [mine.json,cat] is one of a file"
+    "puzzles instead of random targets: names, as cat or [cat,dog]; or train, test or paper, a "
+    "split of the library; or your own JSON file; [mine.json,cat] takes one puzzle of a file"
 )
-TURNS_HELP = "each puzzle at so many angles, evenly spread; 1 is as drawn"
+TURNS_HELP = "number of angles of each puzzle, evenly spread; 1: as drawn"
 
 
 def game_run() -> str:
-    """The run that plays puzzles unless another is named."""
+    """The run that plays puzzles by default."""
     return f"{PREFIX}/{GAME}"
 
 
 def _check_run(run_dir: str | None, puzzles: bool) -> None:
-    """Refuse no run where none can be meant."""
+    """Refuse a missing run_dir if there is no default run."""
     if run_dir is not None:
         check_folder("run_dir", run_dir)
     elif not (puzzles and GAME in agent_names()):
@@ -57,37 +57,37 @@ def _check_out(value: str) -> None:
 
 
 def _check_kept(out: str, name: str, source: str | None) -> None:
-    """Refuse to write over what is read."""
+    """Refuse an output file that is the input file."""
     with suppress(OSError):  # one of both is no file
         if source is not None and Path(out).samefile(source):
-            raise ConfigError(f"out={out} would be written over {name}={source}: name another file")
+            raise ConfigError(f"out={out} would overwrite {name}={source}: name another file")
 
 
 @dataclass(frozen=True)
 class EvalConfig(Settings):
-    """Scores of a finished run on the fixed test set, or on puzzles (tangram-eval).
+    """Settings of tangram-eval, which scores a finished run on fixed tests or puzzles.
 
     Attributes:
-        changes: settings of sim and agent that are not to be as the run was trained with.
+        changes: settings of task, sim, reward and agent that override those of the run.
     """
 
     run_dir: str | None = setting(
-        None, "folder of the run, or pretrained/NAME; with puzzle= pretrained/tangram7 if not given"
+        None, "folder of the run, or pretrained/NAME; with puzzle=, default pretrained/tangram7"
     )
     episodes: int = setting(
         100,
-        "test episodes, the same ones for every run",
+        "number of test episodes, the same ones for every run",
         low=1,
         high=MAX_EPISODES,
         only={"puzzle": None},
     )
     seed: int = setting(
-        0, "of the test episodes, and of the starts of puzzles", low=0, high=MAX_SEED
+        0, "seed of the test episodes, or of the starts of puzzles", low=0, high=MAX_SEED
     )
     rivals: tuple[str, ...] = setting(
-        ALL, "who learned nothing and plays the same: all whom the task has, some by name, [] none"
+        ALL, "baselines that play the same episodes: all of the task, some by name, or [] for none"
     )
-    out: str | None = setting(None, "JSON file for the scores; they are printed anyway")
+    out: str | None = setting(None, "JSON file for the scores, which are also printed")
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
     changes: Changes = field(default_factory=dict)
@@ -109,10 +109,10 @@ class EvalConfig(Settings):
 
 
 def check_puzzle(value: object) -> tuple[str, ...] | None:
-    """The names of puzzles, one or a list of some, perhaps behind their file; None is none.
+    """Names of puzzles as a tuple, perhaps with their file first; None if there are none.
 
     Raises:
-        ConfigError: says how to write them.
+        ConfigError: the value has another form; the text says how to write it.
     """
     if value is None:
         return None
@@ -130,12 +130,12 @@ def check_puzzle(value: object) -> tuple[str, ...] | None:
 
 
 def is_puzzle_source(name: str) -> bool:
-    """Whether this is no puzzle's name but a file's, or a split of the library."""
+    """Whether a name is that of a file or of a split of the library, not of a puzzle."""
     return name in SPLITS or "/" in name or Path(name).suffix.lower() in PUZZLE_FILES
 
 
 def source_and_names(puzzle: tuple[str, ...]) -> tuple[str | None, tuple[str, ...] | None]:
-    """Where puzzles are, None for all of the library, and which of them are meant, None for all."""
+    """File or split of puzzles (None: the whole library), and their names (None: all)."""
     if not is_puzzle_source(puzzle[0]):
         return None, puzzle
     return puzzle[0], puzzle[1:] or None
@@ -143,10 +143,10 @@ def source_and_names(puzzle: tuple[str, ...]) -> tuple[str | None, tuple[str, ..
 
 @dataclass(frozen=True)
 class PlayConfig(Settings):
-    """Pictures of a run at play (tangram-play).
+    """Settings of tangram-play, which draws the episodes of a run.
 
     Attributes:
-        changes: settings of sim and agent that are not to be as the run was trained with.
+        changes: settings of task, sim, reward and agent that override those of the run.
     """
 
     run_dir: str | None = setting(
@@ -154,8 +154,8 @@ class PlayConfig(Settings):
     )
     out: str = setting(
         "runs/play.gif",
-        ".gif or .mp4 for an animation, .png for one picture; .json or .svg for where tokens lie "
-        "in a target, .json for a finger's way points",
+        "file to write: .gif or .mp4, an animation; .png, one picture; .json or .svg, positions of "
+        "the tokens in a target; .json, also way points of a finger",
     )
     episodes: int = setting(
         12,
@@ -164,17 +164,19 @@ class PlayConfig(Settings):
         high=MAX_SHOWN,
         only={"puzzle": None, "target": None, "silhouette": None},
     )
-    seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
+    seed: int = setting(
+        0, "seed of the episodes, or of the starts of puzzles", low=0, high=MAX_SEED
+    )
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
     target: str | None = setting(
         None,
-        "instead of random targets: a puzzle by name, or a file: a puzzle, a drawing, a black "
-        "figure, a photograph of all tokens, three touching at most; what it is taken for is told",
+        "target instead of random ones: name of a puzzle, or a file: a puzzle, a drawing, a "
+        "black figure, or a photograph of all tokens, three touching at most; the kind is printed",
         only={"puzzle": None},
     )
     silhouette: str | None = setting(
         None,
-        "the same, taken for a figure whose pieces nobody sees: how the tokens fill it is searched",
+        "as target, but always a figure with hidden pieces, which a search fills with tokens",
         only={"puzzle": None, "target": None},
     )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
@@ -204,7 +206,7 @@ class PlayConfig(Settings):
 
     @property
     def data(self) -> bool:
-        """Whether numbers are asked for, and no picture."""
+        """Whether `out` is a file of data, not a picture."""
         return Path(self.out).suffix in DATA
 
     @property
@@ -215,14 +217,14 @@ class PlayConfig(Settings):
 
 @dataclass(frozen=True)
 class ExportConfig(Settings):
-    """An agent as a file that plays without torch (tangram-export).
+    """Settings of tangram-export, which writes an agent as a file that plays without torch.
 
     Attributes:
-        changes: settings of the agent that are not to be as the run was trained with.
+        changes: settings that override those of the run.
     """
 
     run_dir: str = setting("???", "folder of the run, or pretrained/NAME")
-    out: str = setting("runs/agent.onnx", "the file")
+    out: str = setting("runs/agent.onnx", "ONNX file to write")
     changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:

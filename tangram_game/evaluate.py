@@ -1,4 +1,4 @@
-"""tangram-eval: what a finished run scores on the fixed test set, or on puzzles."""
+"""tangram-eval: scores of a finished run on the fixed test set, or on puzzles."""
 
 import json
 import time
@@ -35,10 +35,10 @@ from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 from worker.score.test_set import FixedTests
 
-MAX_PADDED = 4  # policies in a table
-MAX_LINES = 40  # of puzzles and of faults on the screen
+MAX_PADDED = 4  # policies in a table with blanks between its columns
+MAX_LINES = 40  # puzzles on the screen
 
-# What is shown beside the scores that a task declares; the rest is only in the file.
+# Scores shown besides those that a task declares; all others are only in the file.
 _BESIDE = (
     Score("seconds_per_puzzle", "seconds"),
     Score("ms_per_choice", "CPU ms for each action", 1),
@@ -52,8 +52,8 @@ def evaluate_run(config: EvalConfig) -> int:
         Exit status 0.
 
     Raises:
-        RunError: a folder or a checkpoint that is missing or corrupt, or a file is not writable.
-        ConfigError: puzzles or settings that the run cannot play.
+        RunError: a folder or a checkpoint is missing or corrupt, or a file is not writable.
+        ConfigError: the run cannot play these puzzles or settings.
     """
     torch.set_num_threads(1)
     began = time.monotonic()
@@ -67,10 +67,10 @@ def evaluate_run(config: EvalConfig) -> int:
 
 
 def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
-    """The run, and those to compare it with, by their names in tables and files.
+    """The run and its rivals, by their names in tables and files.
 
     Raises:
-        ConfigError: there is no such rival.
+        ConfigError: a rival is unknown.
     """
     others = _rivals(run)
     if tuple(rivals) != ALL:
@@ -84,7 +84,7 @@ def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
 def _rivals(run: Run) -> dict[str, Player]:
     others, agent = dict[str, Player](), run.setup.agent
     if isinstance(agent, Outline):
-        # Of places that are worth the same the first is taken: that of the largest token.
+        # With weights of 0 all places are worth the same; the first is the largest token's.
         others["largest first"] = by(run.unlearned().actor)
     return others | dict(run.setup.task.rivals())
 
@@ -92,7 +92,7 @@ def _rivals(run: Run) -> dict[str, Player]:
 def score_policies(
     task: Task, players: Mapping[str, Player], config: EvalConfig
 ) -> dict[str, Scores]:
-    """Scores of each policy, on the same episodes."""
+    """Score each policy on the same episodes."""
     with closing(FixedTests(task, config.episodes, AT_ONCE, seed=config.seed)) as tests:
         return {name: _scored(tests, player) for name, player in players.items()}
 
@@ -111,7 +111,7 @@ def _scored(tests: FixedTests, player: Player) -> Scores:
 
 
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
-    """Play the test episodes and print the scores; the file's content."""
+    """Play the test episodes and print the scores; returns the content of the file."""
     task = run.setup.task
     scores = score_policies(task, policies(run, config.rivals), config)
     tests = "fixed tests" if config.seed == 0 else f"tests of seed {config.seed}"
@@ -123,7 +123,7 @@ def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
 
 
 def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
-    """Assemble the puzzles and print the scores; the file's content."""
+    """Assemble the puzzles and print the scores; returns the content of the file."""
     source, names = source_and_names(config.puzzle or ())
     task = run.task
     figures = find_figures(source, task, names, config.turns)
@@ -144,7 +144,7 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
 
 
 def _report(run: Run, config: EvalConfig, scores: Mapping[str, Scores]) -> dict[str, Any]:
-    """The file's content: the run's scores on top, by the same names as in result.json."""
+    """Content of the file: first the run's scores, named as in result.json."""
     task, world = run.setup.task, dict[str, Any]()
     if isinstance(task, Place):
         world = {"tokens": [shape.name for shape in task.layout.shapes], "sim": asdict(task.sim)}
@@ -187,8 +187,8 @@ def _observed(sim: SimConfig) -> str:
 def scores_table(
     title: str, caption: str, declared: Sequence[Score], scores: Mapping[str, Scores]
 ) -> Table:
-    """One column for each policy, one row for each score."""
-    # More than five fit into 80 columns without the blanks.
+    """A table with one column for each policy and one row for each score."""
+    # Without blanks, more than five policies fit into 80 characters.
     table = Table(title=title, caption=caption, padding=(0, int(len(scores) <= MAX_PADDED)))
     table.add_column("", no_wrap=True)
     for name in scores:
@@ -202,11 +202,11 @@ def scores_table(
 
 
 def puzzles_table(puzzles: Sequence[Mapping[str, Any]], full: str | None) -> Table:
-    """One line for each puzzle that the run played, the first `MAX_LINES` of them.
+    """A table with one line for each puzzle that the run played, `MAX_LINES` at most.
 
     Args:
-        puzzles: scores of each.
-        full: file that has all of them, if any.
+        puzzles: scores of each puzzle.
+        full: file with all of them, if there is one.
     """
     left = len(puzzles) - MAX_LINES
     rest = f"and {left:,} more: all are in {full or 'the file that out= names'}"

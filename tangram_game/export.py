@@ -30,7 +30,7 @@ from tangram_game.config import ExportConfig
 from worker.score.test_set import FixedTests
 
 OPSET = 20  # of ONNX 1.15, 2023
-OBSERVATIONS, CLOSE = 1000, 1e-5  # that must agree so well with torch
+OBSERVATIONS, CLOSE = 1000, 1e-5  # compared with torch; largest difference of an action
 OUTPUT, MOST_TIES = "action", 0.01
 FAILED = (
     state.Fail,
@@ -39,15 +39,15 @@ FAILED = (
     state.NotImplemented,
     state.RuntimeException,
 )
-_NEAR, _ROUNDING = 64, 1e-5  # neighbours of an observation that are asked, and how near they are
-_NO_TIE = 1e-2  # what is less off is no other choice
+_NEAR, _ROUNDING = 64, 1e-5  # disturbed copies of an observation, and the disturbance
+_NO_TIE = 1e-2  # a smaller difference is not another choice
 
 
 def export_run(config: ExportConfig, tell: Callable[[str], None] = print) -> int:
-    """Write an agent as ONNX once it plays as in torch; returns exit status 0.
+    """Write an agent as ONNX if its actions equal those in torch; returns exit status 0.
 
     Raises:
-        RunError: the run is missing or corrupt, the file is not writable, or it plays otherwise.
+        RunError: the run is missing or corrupt, the file is not writable, or actions differ.
         ConfigError: the agent is more than a network.
     """
     torch.set_num_threads(1)
@@ -56,28 +56,28 @@ def export_run(config: ExportConfig, tell: Callable[[str], None] = print) -> int
     found = compared(run, content)
     if not (found.apart <= CLOSE and found.ties <= MOST_TIES * found.count):
         raise RunError(
-            f"{config.out} is not written, it plays otherwise than torch: an action is "
-            f"{found.apart:.1e} off, {CLOSE:g} is the most; {found.ties} of {found.count} are "
-            f"ties, {MOST_TIES:.0%} is the most: try the versions of onnx and onnxruntime that "
-            "constraints.txt names, or play it by tangram_agent.runs.load_run"
+            f"{config.out} is not written, its actions differ from those of torch: by "
+            f"{found.apart:.1e}, at most {CLOSE:g} allowed; {found.ties} of {found.count} are "
+            f"ties, at most {MOST_TIES:.0%} allowed: try the versions of onnx and onnxruntime "
+            "in constraints.txt, or play the run by tangram_agent.runs.load_run"
         )
     write_whole(Path(config.out), content)
     spec = run.setup.spec
     sides = {name: ", ".join(map(str, spec.field(name).shape)) for name in inputs(run)}
     seen = ", ".join(f"{name} (B, {own})" for name, own in sides.items())
     tell(f"{config.out}: {OUTPUT} (B, {spec.action_size}) of {seen}, all float32")
-    ties = f"; {found.ties} ties, of equal worth, go another way" if found.ties else ""
-    tell(f"in {found.count} observations at most {found.apart:.1e} off what torch plays{ties}")
+    ties = f"; {found.ties} ties, of equal worth, are decided otherwise" if found.ties else ""
+    tell(f"checked: {found.count} actions differ from torch by at most {found.apart:.1e}{ties}")
     return 0
 
 
 def inputs(run: Run) -> tuple[str, ...]:
-    """The names of what it sees: the fields that the task's environments show."""
+    """Names of the agent's inputs: the fields that the task's environments show."""
     return tuple(field.name for field in run.setup.spec.fields if field.per != "step")
 
 
 def exported(run: Run) -> bytes:
-    """The file: inputs by the names of the task's fields, any number of rows at a time.
+    """Content of the ONNX file: inputs named as the task's fields, any number of rows.
 
     Raises:
         ConfigError: the agent is more than a network.
@@ -87,7 +87,7 @@ def exported(run: Run) -> bytes:
     names = inputs(run)
     seen = {name: torch.zeros(2, *spec.field(name).shape) for name in names}
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder, torch.no_grad():
-        warnings.simplefilter("ignore")  # of torch, at its own code
+        warnings.simplefilter("ignore")  # torch warns about its own code
         torch._logging.set_logs(all=logging.ERROR)  # type: ignore[attr-defined]
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         try:
@@ -100,7 +100,7 @@ def exported(run: Run) -> bytes:
                 dynamic_shapes={"seen": dict.fromkeys(names, rows)},
                 opset_version=OPSET,
                 dynamo=True,
-                optimize=False,  # onnxruntime does, when it loads it; here it takes half the time
+                optimize=False,  # onnxruntime does so at load; here it takes half the time
                 verbose=False,
             )
         except torch.onnx.errors.OnnxExporterError as error:
@@ -112,7 +112,7 @@ def exported(run: Run) -> bytes:
 
 
 def _clean(model: onnx.ModelProto, run: Run) -> bytes:
-    """Without the lines of code that torch notes at each node, with what it is of."""
+    """Content without torch's notes of source lines, and with the run's updates and setup."""
     for graph in (model.graph, *model.functions):
         for node in graph.node:
             del node.metadata_props[:]
@@ -129,12 +129,12 @@ def _clean(model: onnx.ModelProto, run: Run) -> bytes:
 
 @dataclass
 class Compared:
-    """How observations of real play are answered, beside torch.
+    """Differences between the actions of the file and of torch.
 
     Attributes:
-        count: of them.
-        apart: how far an action is off, at most, ties left out.
-        ties: of two choices of equal worth another one.
+        count: number of compared observations.
+        apart: largest difference of an action, without ties.
+        ties: observations with two actions of equal worth, of which the file takes the other.
     """
 
     count: int = 0
@@ -143,7 +143,7 @@ class Compared:
 
 
 def compared(run: Run, content: bytes) -> Compared:
-    """Play so many observations in both ways, on one thread each.
+    """Compare actions on `OBSERVATIONS` observations of real play, on one thread each.
 
     Raises:
         RunError: the file cannot be played, or gives no actions.
@@ -161,7 +161,7 @@ def compared(run: Run, content: bytes) -> Compared:
             if _is_tie(run, {name: one[row] for name, one in shown.items()}, other[row]):
                 found.ties, apart[row] = found.ties + 1, 0.0
         found.count += len(own)
-        found.apart = float(np.maximum(found.apart, apart.max()))  # nan, if there is one
+        found.apart = float(np.maximum(found.apart, apart.max()))  # np.maximum keeps nan
         return own
 
     horizon = run.setup.spec.horizon
@@ -171,9 +171,9 @@ def compared(run: Run, content: bytes) -> Compared:
 
 
 def _player(run: Run, content: bytes) -> Callable[[Arrays], Singles]:
-    """Who plays the file: observations (B, ...) float32 -> actions (B, A), which are checked."""
+    """A function that plays the file: observations (B, ...) float32 -> checked actions (B, A)."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.log_severity_level = 1, 4  # an error is raised, too
+    options.intra_op_num_threads, options.log_severity_level = 1, 4  # errors are also raised
     size = run.setup.spec.action_size
     try:
         session = onnxruntime.InferenceSession(content, options)
@@ -187,9 +187,11 @@ def _player(run: Run, content: bytes) -> Callable[[Arrays], Singles]:
             raise _unwritten(run, str(error)) from error
         wanted = (len(next(iter(shown.values()))), size)
         if actions.shape != wanted or actions.dtype != np.float32:
-            raise _unwritten(run, f"it gives {actions.shape} {actions.dtype} for {wanted} float32")
+            raise _unwritten(
+                run, f"its actions are {actions.shape} {actions.dtype}, not {wanted} float32"
+            )
         if not np.isfinite(actions).all():
-            raise _unwritten(run, "it gives actions that are no numbers")
+            raise _unwritten(run, "its actions are not finite")
         played: Singles = actions
         return played
 
@@ -198,13 +200,13 @@ def _player(run: Run, content: bytes) -> Callable[[Arrays], Singles]:
 
 def _unwritten(run: Run, why: str) -> RunError:
     return RunError(
-        f"{run.folder} cannot be written as ONNX: {why.strip().splitlines()[0]}: make graph() of "
-        "other operations"
+        f"{run.folder} cannot be written as ONNX: {why.strip().splitlines()[0]}: use other "
+        "operations in graph()"
     )
 
 
 def _is_tie(run: Run, shown: Arrays, other: Singles) -> bool:
-    """Whether torch itself plays (A,) so where what it sees is off by rounding."""
+    """Whether torch also takes the action (A,) if the observation is off by rounding."""
     rng, near = np.random.default_rng(0), dict[str, Singles]()
     for name, one in shown.items():
         near[name] = np.repeat(one[None], _NEAR, axis=0)

@@ -1,4 +1,4 @@
-"""tangram-play: episodes of finished runs as an animation or as one picture."""
+"""tangram-play: episodes of a finished run as an animation, a picture or data."""
 
 import json
 import math
@@ -40,7 +40,7 @@ from worker.score.test_set import FixedTests
 FRAME_MS = 50
 STILL_START, STILL_END = 10, 30  # frames
 SHOWN = "what the agent is shown"
-SEEN = 30  # frames of what was seen before a film
+SEEN = 30  # frames of the picture with the target, before a film
 SHEET = 720  # pixels across, about
 MIN_TILE, MAX_TILE = 64, 240
 GAP = 24  # pixels between pictures
@@ -48,18 +48,18 @@ PAPER, RULE = (250, 250, 247), (214, 214, 208)
 
 
 def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
-    """Play puzzles, a photograph or random episodes, noise off, and draw them side by side.
+    """Play puzzles, a photograph or random episodes without exploration, and draw them.
 
     Args:
         config: the settings.
-        silhouette: what fills theirs, if that was searched before.
+        silhouette: the filled silhouette, if its search is done.
 
     Returns:
         Exit status 0.
 
     Raises:
-        RunError: a folder or a checkpoint that is missing or corrupt, or `out` is not writable.
-        ConfigError: puzzles that the run cannot play.
+        RunError: a folder or a checkpoint is missing or corrupt, or `out` is not writable.
+        ConfigError: the run cannot play the puzzles.
     """
     torch.set_num_threads(1)
     run = load_changed(config.run, config.changes)
@@ -75,7 +75,7 @@ def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
 
 
 def _shown(run: Run, config: PlayConfig) -> str:
-    """Write what a task that is not of tokens makes of its episodes; returns what to tell."""
+    """Write a plan, a film or a picture of a task other than `Place`; returns the line to print."""
     task, kind = run.setup.task, Path(config.out).suffix
     count = 1 if kind == ".json" else config.episodes
     with closing(FixedTests(task, count, AT_ONCE, role="play", seed=config.seed)) as tests:
@@ -99,10 +99,10 @@ def _shown(run: Run, config: PlayConfig) -> str:
 
 
 def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> Show:
-    """What the settings name, played by a run; see `play_run`.
+    """Play what the settings name; see `play_run`.
 
     Raises:
-        ConfigError: puzzles or a photograph that the run cannot play.
+        ConfigError: the run cannot play the target.
     """
     if config.puzzle is not None:
         return puzzle_show(run, config)
@@ -117,7 +117,7 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
 
 
 def play_episodes(run: Run, config: PlayConfig) -> Played:
-    """The episodes that the settings name, played by a run."""
+    """Play episodes with random targets."""
     with closing(
         FixedTests(run.task, config.episodes, AT_ONCE, role="play", seed=config.seed)
     ) as tests:
@@ -125,10 +125,10 @@ def play_episodes(run: Run, config: PlayConfig) -> Played:
 
 
 def puzzle_show(run: Run, config: PlayConfig) -> Show:
-    """The puzzles that the settings name, their pieces laid out beside them at first.
+    """Play the puzzles that the settings name; the tokens start beside the target.
 
     Raises:
-        ConfigError: puzzles that the run cannot play, or too many of them.
+        ConfigError: the run cannot play the puzzles, or there are too many.
     """
     task = _beside(run.task)
     source, names = source_and_names(config.puzzle or ())
@@ -143,10 +143,10 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
 
 
 def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
-    """What a photograph shows, with the tokens anywhere at first.
+    """Play the figure in a photograph; the tokens start anywhere.
 
     Raises:
-        ConfigError: a photograph that does not show the run's tokens.
+        ConfigError: the photograph does not show the run's tokens.
     """
     photograph = read_photograph(target, run.task)
     figure, player = photograph.figure, by(run.actor)
@@ -156,10 +156,10 @@ def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
 
 
 def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
-    """A silhouette, with the tokens outside of it at first.
+    """Play a silhouette; the tokens start outside of it.
 
-    It is laid as it was found to be filled, or by an agent of outlines: that is shown no more than
-    the outline of what was found, which is the silhouette's within the search's tolerance.
+    A run lays the tokens as the search found. An agent of outlines sees only the outline of what
+    the search found, which equals the silhouette within the search's tolerance.
     """
     task, fills = _beside(run.task), run.task.outlines
     played = play_figures(task, [found.figure], by(run.actor), config.seed)
@@ -177,13 +177,13 @@ def _beside(task: Place) -> Place:
 
 
 def end_picture(show: Show) -> Image.Image:
-    """The ends of all episodes."""
+    """A picture of the ends of all episodes."""
     layout, arena, played = show.task.layout, show.task.sim.arena, show.played
     return figure_sheet(layout, arena, played.ends, played.goals, show.titles)
 
 
 def _frames(show: Show, out: str) -> list[Image.Image]:
-    """One picture of the ends, or the film."""
+    """Frames of the film, or one picture of the ends."""
     task, played = show.task, show.played
     still, game = _is_still(out), task.layout.tokens > 1 or show.seen is not None
     count = len(show.titles)
@@ -205,7 +205,7 @@ def _is_still(out: str) -> bool:
 
 
 def _before(show: Show) -> list[Image.Image]:
-    """What is shown before the film: a photograph of the target, if there is one."""
+    """Pictures before the film: the one from which the target comes, if any."""
     return [] if show.seen is None else [show.seen]
 
 
@@ -225,20 +225,20 @@ def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
 
 
 def draw_sheet(task: Place, played: Played, corners: Floats) -> Image.Image:
-    """One tile for each of E episodes while its tokens are at corners (E, V, 2)."""
+    """A sheet with a tile for each of E episodes, its tokens at corners (E, V, 2)."""
     columns, size = _tiles(len(corners), SHEET)
     scenes = (played.starts, corners, played.goals)
     return episode_sheet(task.layout, task.sim.arena, *scenes, columns, size)
 
 
 def _tiles(count: int, width: int) -> tuple[int, int]:
-    """How many tiles stand in a row of so many pixels, and the side of each in pixels."""
+    """Number of tiles in a row of `width` pixels, and the side of a tile in pixels."""
     columns = math.ceil(math.sqrt(count))
     return columns, min(max(width // columns, MIN_TILE), MAX_TILE)
 
 
 def draw_motion(task: Place, played: Played) -> list[Image.Image]:
-    """The episodes' frames: start, every action as a motion at constant velocity, end."""
+    """Frames of the episodes: start, each action as a motion at constant velocity, end."""
     count = frames_per_action(played.episodes.actions.shape[1])
     return [
         draw_sheet(task, played, corners) for corners in motion(task.layout, played.corners, count)
@@ -246,15 +246,15 @@ def draw_motion(task: Place, played: Played) -> list[Image.Image]:
 
 
 def with_stills(frames: list[Image.Image]) -> list[Image.Image]:
-    """The same film with a rest before and after."""
+    """The same film with still frames added before and after."""
     return [frames[0]] * STILL_START + frames + [frames[-1]] * STILL_END
 
 
 def motion(layout: Layout, corners: Floats, count: int) -> list[Floats]:
     """Corners (E, V, 2) at the start and at `count` equal parts of each action.
 
-    An action turns a token by at most half a turn at constant velocity, so the pose in between is
-    that share of the way along the shorter turn, in either backend; nothing is simulated again.
+    An action moves a token at constant velocity, and turns it by at most half a turn. So poses in
+    between are interpolated along the shorter turn, for either backend. Nothing is simulated.
 
     Args:
         corners: (E, T + 1, V, 2) before each action and after the last.
@@ -272,7 +272,7 @@ def motion(layout: Layout, corners: Floats, count: int) -> list[Floats]:
 
 
 def side_by_side(panels: Sequence[Image.Image]) -> Image.Image:
-    """Pictures in a row, their tops in line, with a rule between them."""
+    """Pictures in a row, aligned at the top, with a rule between them."""
     height = max(panel.height for panel in panels)
     width = sum(panel.width for panel in panels) + GAP * (len(panels) - 1)
     canvas = Image.new("RGB", (width, height), PAPER)

@@ -1,4 +1,4 @@
-"""What a run scores on puzzles, and who learned nothing beside it.
+"""Scores of a run and its rivals on puzzles.
 
 Legend: E puzzles, K tokens, V corners.
 """
@@ -17,11 +17,11 @@ from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 
 RUN = "this run"
-Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes
+Scores = dict[str, Any]  # numbers, and the list `coverage_each`
 
 _SHARES = ("coverage", "iou")
 _ACTIONS = ("refused", "blocked", "actions_used")
-_PIECES = ("wrong", "doubly_used")  # are not told of silhouettes: any dissection counts
+_PIECES = ("wrong", "doubly_used")  # not reported of silhouettes: any dissection counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +29,12 @@ class Scored:
     """Scores of several policies on E puzzles.
 
     Attributes:
-        means: over all puzzles, by the policies' names.
-        puzzles: what the run made of each.
-        titles: of the puzzles.
+        means: mean scores over all puzzles, by the policies' names.
+        puzzles: scores of the run on each puzzle.
+        titles: titles of the puzzles.
         ends: (E, V, 2) corners of the tokens as the run left them.
         goals: (E, V, 2) corners of the puzzles' pieces.
-        told: what is to be known of the scores.
+        told: remark on the scores, for a caption.
     """
 
     means: dict[str, Scores]
@@ -48,7 +48,7 @@ class Scored:
 def score_puzzles(
     task: Place, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
 ) -> Scored:
-    """Scores of each policy on the same starts; who sees outlines fills them itself."""
+    """Score each policy on the same puzzles and starts."""
     played = {name: play_figures(task, figures, player, seed) for name, player in players.items()}
     scores = {name: _of_puzzles(task, own) for name, own in played.items()}
     run, titles = played[RUN], [figure.title for figure in figures]
@@ -66,13 +66,13 @@ def _of_puzzles(task: Place, played: Played) -> Scores:
 
 
 def of_outlines(task: Place, played: Played) -> Scores:
-    """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
+    """Scores of filled outlines, without scores of single pieces: any dissection counts."""
     found = assembled(task.layout, played)
     return _of_areas(found) | {"episodes": float(len(found.iou))} | of_several(played)
 
 
 def _of_areas(found: Assembled) -> Scores:
-    """Means of what tells nothing of single pieces."""
+    """Mean scores of areas and actions, without those of single pieces."""
     means = {name: float(np.mean(getattr(found, name))) for name in (*_SHARES, *_ACTIONS)}
     reward = float(np.mean(scaled_overlap(found.coverage)))
     solved = float(np.mean(found.iou >= SOLVED))
@@ -80,12 +80,12 @@ def _of_areas(found: Assembled) -> Scores:
 
 
 def of_each(played: Played) -> Scores:
-    """Every coverage, for differences that are paired by episode."""
+    """The coverage of each episode, to compare policies episode by episode."""
     return {"coverage_each": np.round(played.overlap, 6).tolist()}
 
 
 def of_several(played: Played) -> Scores:
-    """What only evaluations tell of several tokens: time, and every coverage."""
+    """Times and the coverage of each episode, which only evaluations report."""
     return {
         "seconds_per_puzzle": float(np.mean(played.seconds)),
         "ms_per_choice": 1e3 * float(np.mean(played.chose)) / played.refused.shape[1],
@@ -113,7 +113,7 @@ def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[
 def _line(
     figure: Figure, found: Assembled, e: int, solved: Bools, counts: Sequence[str]
 ) -> dict[str, Any]:
-    """What every list tells of a puzzle; `solved` (E,)."""
+    """Scores of puzzle number `e`, with the named counts; `solved` (E,)."""
     return {
         "name": figure.name,
         "degrees": figure.degrees,

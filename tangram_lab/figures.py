@@ -1,4 +1,4 @@
-"""How figures look, and how they are saved; pyplot's global state is left alone."""
+"""Style and saving of matplotlib figures, without the global state of pyplot."""
 
 import io
 from pathlib import Path
@@ -13,7 +13,7 @@ from tangram_core.store.files import write_whole
 
 DPI = 100
 WIDTH_IN = 9.0
-# Okabe and Ito's colours, for all kinds of colour vision.
+# Colours of Okabe and Ito, distinguishable with colour blindness.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255")
 STYLE: dict[Any, Any] = {
     "axes.grid": True,
@@ -28,7 +28,7 @@ STYLE: dict[Any, Any] = {
 def new_figure(
     height_in: float, panels: int = 1, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """A figure as wide as a README, with panels beside each other."""
+    """A figure of WIDTH_IN inches and its axes, `panels` of them side by side."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
@@ -37,16 +37,16 @@ def new_figure(
 
 
 def legend_below(figure: Figure, panel: Axes) -> None:
-    """One legend for all panels, from the labels of one."""
+    """Add one legend below all panels, with the labels of `panel`."""
     handles, names = panel.get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG.
+    """Write a figure as a PNG file.
 
     Raises:
-        RunError: it cannot be written.
+        RunError: the file cannot be written.
     """
     data = io.BytesIO()
     figure.savefig(data, format="png", metadata={"Software": None})

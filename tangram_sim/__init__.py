@@ -1,6 +1,6 @@
-"""The world of Tangram.
+"""The simulated world: geometry, motion, perception, targets and rewards.
 
-Start with `batch.py`: many environments in step. `config.py` and `rewards.py` are everybody's.
-Folders, each imports those behind it only: world, targets, motion, sight | puzzles | drawing,
-geometry. May import tangram_core; no torch.
+Start with `batch.py`: many environments that step together. A folder imports only folders after it
+in this list: world, targets, motion, sight | puzzles | drawing, geometry. All but geometry may use
+`config.py` and `rewards.py`. May import tangram_core; no torch.
 """

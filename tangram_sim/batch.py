@@ -1,7 +1,7 @@
-"""B environments that play in step: every episode has exactly `horizon` actions.
+"""A batch of B environments that step together; every episode has exactly `horizon` actions.
 
-Episodes of equal length keep everything an array: geometry and rewards are computed once for the
-whole batch, and a batch of episodes travels as a few raw frames.
+Equal lengths allow plain arrays: geometry and rewards are computed once for the whole batch, and a
+batch of episodes is sent as a few raw frames.
 """
 
 from collections.abc import Sequence
@@ -33,18 +33,18 @@ from tangram_sim.world.world import check_shown, make_world
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
-    """What one step of all environments gave.
+    """Results of one step of all environments.
 
     Attributes:
-        rewards: (B,) of the configured reward.
+        rewards: (B,) by the configured reward function.
         overlap: (B,) raw overlap in [0, 1] on exact polygons.
-        camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
-        refused: (B,) where the action named a placed token: nothing moved.
-        blocked: (B,) where the token could not be set down on others: nothing moved.
-        tokens: (B,) which token moved, or would have.
-        covered: (B,) share of its area by which the token was, or would have been, set down on
-            others.
-        done: whether the episodes are over, all at once.
+        camera_rewards: (B,) rewards by Eq. 14 on the pictures; None with the camera off.
+        refused: (B,) whether the action named a placed token; then nothing moved.
+        blocked: (B,) whether the token would have covered others too much; then nothing moved.
+        tokens: (B,) number of the token that the action moved, or would have moved.
+        covered: (B,) share of that token's area that overlaps others where it is set down, or
+            would have been.
+        done: whether the episodes are over; all end in the same step.
     """
 
     rewards: Floats
@@ -58,12 +58,12 @@ class StepResult:
 
 
 class Starts(NamedTuple):
-    """Where the tokens of B episodes lie at first.
+    """Initial states of the tokens in B episodes.
 
     Attributes:
-        poses: (B, K, 3).
-        flipped: (B, K) tokens that lie on their other side.
-        placed: (B, K) tokens that are placed already.
+        poses: (B, K, 3) x, y and angle.
+        flipped: (B, K) tokens that are turned over.
+        placed: (B, K) tokens that are already placed.
     """
 
     poses: Floats
@@ -74,31 +74,32 @@ class Starts(NamedTuple):
 class BatchedEnv:
     """`count` environments in one process.
 
-    An action is (x, y, angular velocity) in [-1, 1], with one entry before them that names the
-    token if there are several, and with `sim.allow_flip` one more between, above 0 where the token
-    is to be turned over before it moves (see `actions.flips`). A token that had its
-    `actions_per_token` actions is placed, and once all are the episode is over for good. A lone
-    token that has several actions is never placed: a time limit ends its episode, and it could as
-    well go on. An action that names a placed token is refused: it moves nothing, but uses up its
-    step. One that would set a token down on others by more than `MAX_OVERLAP` of its
-    area moves nothing either, and is one of the token's actions.
+    An action ends with velocities in x, y and angle, each in [-1, 1]. With several tokens, its
+    first entry names the token. With `sim.allow_flip`, the entry before the velocities turns the
+    token over before it moves, if above 0 (see `actions.flips`).
+
+    A token is placed after its `actions_per_token` actions. When all are placed, the episode is
+    over: a terminal state. A single token with several actions is never placed: only a time limit
+    ends its episode. An action that names a placed token is refused: nothing moves, but the step
+    counts. An action is blocked if more than `MAX_OVERLAP` of the token's area would cover others:
+    nothing moves, but the action counts for the token.
 
     Attributes:
         count: B.
-        spec: what its episodes are made of.
+        spec: names, shapes and bounds of the arrays in an episode.
         horizon: steps of an episode, K * actions_per_token.
         action_size: A.
         bound: largest |coordinate| that a corner can reach, arena units.
-        goal_rows: G, corners of a target as agents see it.
+        goal_rows: G, rows of a target as agents see it.
         steps_done: steps taken in this episode.
         corners: (B, V, 2) of the tokens.
         placed: (B, K) which tokens are placed.
         goals: (B, V, 2) corners of the targets.
-        seen: `corners` as an agent sees them: as they are, or as they are found in pictures.
-        seen_goals: (B, G, 2) `goals` as an agent sees them: so, or rows of their outlines, see
-            `rings`.
-        sight: what is found in pictures, where these are the agent's only source, else None.
-        pictures: (B, P, P) of the tokens, as the camera had them last.
+        seen: `corners` as an agent sees them: exact, or found in pictures.
+        seen_goals: (B, G, 2) `goals` as an agent sees them: exact, found in pictures, or rows of
+            outlines (see `rings`).
+        sight: tokens found in pictures; None unless `sim.observe=pictures`.
+        pictures: (B, P, P) the camera's last pictures of the tokens.
     """
 
     def __init__(
@@ -114,14 +115,14 @@ class BatchedEnv:
 
         Args:
             layout: the tokens.
-            sim: the world.
-            reward: what an action is worth.
-            count: B.
-            eye: finds tokens in pictures, where these are what is observed.
-            outlines: whether who plays takes outlines for goals, for `sim.observe=silhouette`.
+            sim: settings of the world.
+            reward: settings of the reward.
+            count: B, at least 1.
+            eye: function that finds tokens in a picture; needed for `sim.observe=pictures`.
+            outlines: whether agents take outlines as goals; needed for `sim.observe=silhouette`.
 
         Raises:
-            ConfigError: pictures are to be observed, and there is no eye; or silhouettes are.
+            ConfigError: `sim.observe` needs an eye or outlines, and this is missing.
         """
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
@@ -156,13 +157,13 @@ class BatchedEnv:
 
     @property
     def placed(self) -> Bools:
-        """(B, K), see the class."""
+        """(B, K) which tokens are placed."""
         placed: Bools = (self._moves >= self.sim.actions_per_token) & self._ends_by_placing
         return placed
 
     @property
     def closed(self) -> Bools:
-        """(B, K) tokens that no action should name: placed, or not seen while others are."""
+        """(B, K) tokens that no action should name: placed, or unseen while others are seen."""
         placed = self.placed
         if self.sight is None:
             return placed
@@ -175,16 +176,16 @@ class BatchedEnv:
         targets: Sides | None = None,
         starts: Starts | None = None,
     ) -> None:
-        """Begin an episode in every environment: a new target and a new start.
+        """Begin an episode in every environment, with a new target and a new start.
 
         Args:
-            generators: one per environment; all of the episode's randomness comes from it.
-            targets: poses (B, K, 3) and sides (B, K) to assemble; None: they are drawn.
-            starts: where tokens lie, and which are placed already, but in pictures, where alike
-                tokens have no names; None: they are drawn, and none is placed.
+            generators: one per environment, the only source of randomness in its episode.
+            targets: poses (B, K, 3) and sides (B, K) to assemble; None: random.
+            starts: initial states of the tokens; None: random, with no token placed. With
+                `sim.observe=pictures` no token may be placed: equal ones cannot be told apart.
 
         Raises:
-            SamplingError: no layout without overlap was found.
+            SamplingError: no target or start without overlap was found.
         """
         if len(generators) != self.count:
             raise ValueError(f"need {self.count} generators, got {len(generators)}")
@@ -208,7 +209,7 @@ class BatchedEnv:
 
     def _outlined(self) -> Floats:
         """(B, G, 2) rows of the targets' outlines."""
-        # Only here: most runs need no shapely.
+        # Imported here, because most runs need no shapely.
         from tangram_sim.geometry.rings import as_rows, covered_area  # noqa: PLC0415
 
         areas = [covered_area(own, self.layout) for own in self.goals]
@@ -218,11 +219,11 @@ class BatchedEnv:
         """Play one action in every environment.
 
         Args:
-            actions: (B, A); entries beyond [-1, 1] count as the bound.
+            actions: (B, A); entries are clipped to [-1, 1].
 
         Raises:
-            ValueError: wrong shape, or not finite.
-            RuntimeError: the episodes are over, or none was begun.
+            ValueError: the actions have a wrong shape or are not finite.
+            RuntimeError: the episodes are over, or `reset` was never called.
         """
         if self.steps_done >= self.horizon:
             raise RuntimeError(f"the episode of {self.horizon} steps is over: call reset first")
@@ -253,12 +254,12 @@ class BatchedEnv:
         )
 
     def close(self) -> None:
-        """Close all worlds; calling it twice does no harm."""
+        """Close all worlds; further calls do nothing."""
         for world in self._worlds:
             world.close()
 
     def _covered(self, tokens: Ints, velocity: Floats, flip: Bools) -> Floats:
-        """(B,) share of its area by which each token would be set down on others."""
+        """(B,) share of each token's area that would overlap others after its motion."""
         layout, rows = self.layout, np.arange(self.count)
         if layout.tokens == 1:
             return np.zeros(self.count)
@@ -273,8 +274,8 @@ class BatchedEnv:
         return covered
 
     def _begin(self, targets: Sides, starts: Starts) -> None:
-        """Photograph the targets and put the tokens at their starts."""
-        # World after world, here and in `_move`: the engine's memory of each fills the cache.
+        """Take pictures of the targets and put the tokens at their starts."""
+        # One world after the other, here and in `_move`: the memory of one fills the CPU's cache.
         pictures = []
         for b, world in enumerate(self._worlds):
             if self.sim.pixels:
@@ -288,7 +289,7 @@ class BatchedEnv:
             self.sight.begin(np.stack(pictures), self.pictures)
 
     def _move(self, tokens: Ints, velocity: Floats, flip: Bools, idle: Bools) -> Floats | None:
-        """Move in every world; (B,) Eq. 14 of the pictures with the camera on."""
+        """Move in every world; return (B,) rewards by Eq. 14 on the pictures, if any."""
         pictures = []
         for b, world in enumerate(self._worlds):
             if not idle[b]:
@@ -301,14 +302,14 @@ class BatchedEnv:
         return self._targets.rewards(self.pictures)
 
     def _rewards(self, share: Floats, camera: Floats | None) -> Floats:
-        """(B,) of the configured reward, with the raw overlap and Eq. 14 of the pictures."""
+        """(B,) configured rewards, given the raw overlap and the rewards from pictures."""
         observed = self._reward.source == "camera" or self.sight is not None
         if camera is not None and observed and self._reward.name == "overlap":
             return camera
         if self.sight is not None:
             return self.reward_fn(self.seen, self.seen_goals)
         if self._reward.name == "overlap":
-            return scaled_overlap(share)  # what reward_fn gives, without doing it twice
+            return scaled_overlap(share)  # as reward_fn, without computing it twice
         return self.reward_fn(self.corners, self.goals)
 
     def _checked(self, actions: Floats) -> Floats:

@@ -13,10 +13,10 @@ BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense")
 SOURCES = ("polygon", "camera")
 MIN_PIXELS = 16
-SILHOUETTE = "silhouette"  # what the target looks like without its pieces
+SILHOUETTE = "silhouette"  # the target as an outline, without its pieces
 OBSERVED = ("corners", "pictures", SILHOUETTE)
-# Share of a token that may come to lie on others where it is set down: the engine pushes such
-# tokens apart by a little, and with more it would move what is placed.
+# Largest share of a token that may overlap others where it is set down. The engine pushes such
+# tokens apart by a little; with a larger overlap it would move placed tokens too far.
 MAX_OVERLAP = 0.2
 STARTS = ("anywhere", "outside")
 TARGETS = ("uniform", "connected", "figures", "touching")
@@ -24,10 +24,12 @@ TARGETS = ("uniform", "connected", "figures", "touching")
 
 @dataclass(frozen=True)
 class SimConfig(Settings, section="sim"):
-    """The world that tokens move in."""
+    """Settings of the simulated world."""
 
     backend: str = setting(
-        "physics", "PyBullet, or the exact rigid motion without an engine", choices=BACKENDS
+        "physics",
+        "physics: PyBullet; kinematic: exact rigid motion without an engine",
+        choices=BACKENDS,
     )
     arena: float = setting(
         2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens", part=NETWORK
@@ -35,44 +37,45 @@ class SimConfig(Settings, section="sim"):
     actions_per_token: int = setting(1, "actions that each token has", low=1, high=100)
     observe: str = setting(
         "corners",
-        "what agents see: corners as they are, or what is found in the camera's pictures; then "
-        "Eq. 14 is measured on pictures, too, and scores are exact polygons all the same; "
-        "silhouette: of the target only its outline, which agent=outline fills itself and others "
-        "have filled by a search",
+        "corners: agents see exact corners; pictures: they see tokens found in the camera's "
+        "pictures, Eq. 14 is measured on pictures, too, and scores on exact polygons; silhouette: "
+        "they see the target's outline only, which agent=outline or, for others, a search fills",
         choices=OBSERVED,
     )
     targets: str = setting(
         "uniform",
-        "uniform: pieces apart, anywhere; connected: edge to edge; figures: puzzles of the train "
-        "split; touching: connected or figures by chance",
+        "uniform: separate pieces at random poses; connected: edge to edge; figures: puzzles of "
+        "the train split; touching: connected or figures at random",
         choices=TARGETS,
     )
     overhang: bool = setting(
         False,
-        "the middles of tokens lie anywhere in the arena, so that they may hang over its edge",
+        "centres of tokens are random in the whole arena, so that tokens may reach over its edge",
     )
     starts: str = setting(
         "anywhere",
-        "in the arena, or outside of the target where there is room",
+        "anywhere in the arena, or outside the target where there is room",
         choices=STARTS,
     )
     mirrored: float = setting(
         0.0,
-        "share of episodes in which chiral tokens lie on their other side, in start and target",
+        "share of episodes in which chiral tokens are turned over, in start and target",
         low=0,
         high=1,
     )
-    allow_flip: bool = setting(False, "starts on any side; an action may turn its token over")
+    allow_flip: bool = setting(
+        False, "chiral tokens start on random sides; an action may turn its token over"
+    )
     pixels: int = setting(
         0,
-        "side of the camera's square pictures, from at least 16; 0: none are taken, but by "
-        "evaluators, which report Eq. 14 by them",
+        "side of the camera's square pictures, at least 16; with 0 only evaluators take pictures, "
+        "to report Eq. 14 on them",
         low=0,
         high=1024,
     )
     view: float = setting(
         1.0,
-        "width of what pictures show, in arenas",
+        "width of the area in a picture, as a multiple of the arena's width",
         low=1,
         high=100,
         unless={"pixels": 0},
@@ -80,7 +83,7 @@ class SimConfig(Settings, section="sim"):
 
     @property
     def looks(self) -> bool:
-        """Whether agents see nothing but the camera's pictures."""
+        """Whether agents see only the camera's pictures."""
         return self.observe == "pictures"
 
     @property
@@ -111,9 +114,9 @@ class SimConfig(Settings, section="sim"):
 
 
 def with_given_reward(read: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a reward that were read from a file, and over them those of a command line.
+    """The reward settings of a file, overridden by those of a command line.
 
-    A file may come from anybody: it can name code, but only a command line has it loaded.
+    A file may come from anybody, so code that only a file names is not loaded.
 
     Raises:
         ConfigError: the file names code, and the command line names no reward.
@@ -131,7 +134,7 @@ def with_given_reward(read: Mapping[str, Any], given: Mapping[str, Any]) -> dict
 
 @dataclass(frozen=True)
 class RewardConfig(Settings, section="reward"):
-    """What an action is worth."""
+    """Settings of the reward."""
 
     name: str = setting(
         "overlap",
@@ -143,7 +146,7 @@ class RewardConfig(Settings, section="reward"):
         choices=SOURCES,
     )
     sha256: str | None = setting(
-        None, "of your own file, as a run writes it down: a file with another content is refused"
+        None, "hash of your own file, recorded by a run; a file with other content is refused"
     )
 
     def __post_init__(self) -> None:
@@ -163,5 +166,5 @@ class RewardConfig(Settings, section="reward"):
 
     @property
     def own(self) -> tuple[Path, str] | None:
-        """File and function of a reward of the user's own."""
+        """File and function of the user's own reward; None for a built-in one."""
         return own_code(self.name)

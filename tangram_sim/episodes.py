@@ -1,4 +1,4 @@
-"""What the episodes of tokens are made of, by the names under which they travel."""
+"""Names, shapes and bounds of the arrays in an episode of tokens."""
 
 from tangram_core.spec import EpisodeSpec, Field
 from tangram_sim.config import RewardConfig, SimConfig
@@ -10,13 +10,15 @@ from tangram_sim.rewards import reward_bounds
 def spec_of(
     layout: Layout, sim: SimConfig, reward: RewardConfig, outlines: bool = False
 ) -> EpisodeSpec:
-    """What episodes of these tokens are made of.
+    """The names, shapes and bounds of the arrays in an episode of these tokens.
 
-    corners (V, 2) of the tokens and goals (V, 2) of their targets are as they are seen; placed (K,)
-    is 1 where a token is placed. Where pictures are what is observed, seen (K,) is 1 where a token
-    was found in the picture, or should have left that of several tokens, and goals_seen (K,) the
-    same of the target's pieces; closed (K,) is 1 where no action should name a token: it is placed,
-    or not seen while others are. With `outlines` goals are rows (G, 2) of outlines.
+    corners (V, 2) of the tokens and goals (V, 2) of their targets are as the agent sees them. With
+    `outlines`, goals are rows (G, 2) of outlines. placed (K,) is 1 for a placed token.
+
+    `sim.observe=pictures` adds three arrays. seen (K,) is 1 for a token found in the picture; with
+    several tokens also for one that should have left it. goals_seen (K,) is 1 for a piece found in
+    the target's picture. closed (K,) is 1 for a token that no action should name: it is placed, or
+    unseen while others are seen.
     """
     tokens, bound = layout.tokens, corner_bound(layout.tokens, sim)
     looks = (

@@ -1,6 +1,6 @@
-"""What a state is worth: pure functions of achieved and desired corners, vectorised.
+"""Rewards: pure functions of achieved and desired corners, vectorised.
 
-Every reward lies in about [-1, 1] and is +1 exactly where the goal is reached. Legend as in
+Every built-in reward lies in [-1, 1] and is +1 exactly where the goal is reached. Legend as in
 arrays.py: achieved and desired are (B, V, 2) corners, rewards are (B,).
 """
 
@@ -19,9 +19,9 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import covered_share
 from tangram_sim.sight.pictures import token_pixels
 
-MAX_REWARD = 1e6  # of a user's own function
-LEAST_SHOWN = 16  # pixels that a token covers at least where Eq. 14 is measured on pictures
-# s: how steep the logarithm is near the target; the authors' 2.83 / .01.
+MAX_REWARD = 1e6  # largest |reward| that a user's own function may return
+LEAST_SHOWN = 16  # fewest pixels of a token where Eq. 14 is measured on pictures
+# s: steepness of the logarithm near the target; in the authors' code 2.83 / .01.
 SHARPNESS = 200.0 * 2.0**0.5
 RewardFn = Callable[[Floats, Floats], Floats]
 UserReward = Callable[[Floats, Floats, Layout], Any]
@@ -30,17 +30,17 @@ UserReward = Callable[[Floats, Floats, Layout], Any]
 def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardFn:
     """The configured reward as a function (achieved, desired) -> (B,).
 
-    With source=camera it is Eq. 14 on polygons too, and -1 for a goal that no picture shows: one
-    that was relabelled has none. `BatchedEnv` replaces it by the camera's value while playing.
+    With source=camera, too, the function computes Eq. 14 on polygons: a relabelled goal has no
+    picture. Goals outside the picture give -1. While playing, `BatchedEnv` uses the camera's value.
 
     Raises:
-        ConfigError: the camera is to be the source but is off or too coarse, or a user's function
-            that cannot be loaded; later, when called, one whose output has the wrong shape or is
-            not finite.
+        ConfigError: the camera is the source but is off or too coarse, or a user's function cannot
+            be loaded. A call raises it if a user's function fails, or returns a wrong shape or
+            numbers beyond MAX_REWARD.
     """
     if config.source == "camera":
         _check_camera(layout, sim)
-    # The longest distance of two points of the arena.
+    # The largest distance between two points of the arena.
     reach = sim.arena * np.sqrt(2.0)
     if config.own is not None:
         function = _load(config, *config.own)
@@ -60,13 +60,13 @@ def _check_camera(layout: Layout, sim: SimConfig) -> None:
     if sim.pixels < pixels:
         shown = (sim.pixels / side.max()) ** 2
         raise ConfigError(
-            f"reward.source=camera measures tokens in pixels, and {worst.name} covers {shown:.3g} "
-            f"of at least {LEAST_SHOWN}: raise sim.pixels from {sim.pixels} to {pixels}"
+            f"reward.source=camera needs tokens of at least {LEAST_SHOWN} pixels, and {worst.name} "
+            f"covers {shown:.3g}: raise sim.pixels from {sim.pixels} to {pixels}"
         )
 
 
 def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
-    """Call the configured reward once, so that a user's function fails before anything starts.
+    """Call the configured reward once, so that a faulty user's function fails before a run starts.
 
     Raises:
         ConfigError: see `make_reward`.
@@ -78,26 +78,26 @@ def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
 
 
 def overlap(achieved: Floats, desired: Floats, layout: Layout) -> Floats:
-    """Eq. 14 on exact polygons, from [0, 1] to [-1, 1]: r = 2 * covered share of the target - 1."""
+    """Eq. 14 on exact polygons, scaled to [-1, 1]: r = 2 * covered share of the target - 1."""
     return scaled_overlap(covered_share(achieved, desired, layout))
 
 
 def _shown(achieved: Floats, desired: Floats, layout: Layout, width: float) -> Floats:
-    """Eq. 14, and -1 where pictures of such a width show no corner of the goal."""
+    """Eq. 14, but -1 where a picture of this width shows no corner of the goal."""
     shown = np.abs(desired).max(axis=2).min(axis=1) < width / 2.0
     return np.where(shown, overlap(achieved, desired, layout), -1.0)
 
 
 def scaled_overlap(share: Floats) -> Floats:
-    """The reward (B,) in [-1, 1] of a raw overlap (B,) in [0, 1]."""
+    """The reward (B,) in [-1, 1] for a raw overlap (B,) in [0, 1]."""
     return 2.0 * share - 1.0
 
 
 class TargetPictures:
-    """Pictures (B, P, P) of the targets, as Eq. 14 compares others with them."""
+    """Pictures (B, P, P) of the targets, to score other pictures by Eq. 14."""
 
     def __init__(self, targets: Pixels) -> None:
-        """Count the pixels of each.
+        """Count the pixels that each target covers.
 
         Raises:
             ConfigError: a target covers no pixel.
@@ -112,18 +112,18 @@ class TargetPictures:
             )
 
     def rewards(self, states: Pixels) -> Floats:
-        """Eq. 14 (B,) of other pictures (B, P, P), from [0, 1] to [-1, 1]."""
+        """Rewards (B,) by Eq. 14 for pictures (B, P, P) of the tokens, scaled to [-1, 1]."""
         covered = np.count_nonzero(self._wanted & token_pixels(states), axis=(1, 2))
         rewards: Floats = 2.0 * covered / self._total - 1.0
         return rewards
 
 
 def dense(achieved: Floats, desired: Floats, layout: Layout, reach: float) -> Floats:
-    """Eq. 15: the distance of each token's centre from its target's, as `closeness`.
+    """Eq. 15: `closeness` of each token's centre to its target's centre, averaged over tokens.
 
     The paper scales the distance "across all possible distances" and gives no constants. Here the
-    scale is the arena's diagonal. Several tokens: the mean of their rewards, so that one that is
-    far away does not flatten the slope for one that is near.
+    scale `reach` is the arena's diagonal. The mean is of rewards and not of distances: so a distant
+    token does not flatten the slope for a near one.
     """
     gap = layout.bases(achieved) - layout.bases(desired)
     mean: Floats = closeness(np.linalg.norm(gap, axis=-1), reach).mean(axis=-1)
@@ -131,25 +131,26 @@ def dense(achieved: Floats, desired: Floats, layout: Layout, reach: float) -> Fl
 
 
 def closeness(distance: Floats, reach: float) -> Floats:
-    """+1 at distance 0, -1 from `reach` on: r = 1 - 2 log(1 + s d / reach) / log(1 + s).
+    """The reward for a distance d: r = max(-1, 1 - 2 log(1 + s d / reach) / log(1 + s)).
 
-    As in the authors' code: the slope at the target is 50 times that of a straight line.
+    It is +1 at 0 and -1 from `reach` on. The slope at 0 is 50 times that of a straight line, as in
+    the authors' code.
     """
     scaled: Floats = 1.0 - 2.0 * np.log1p(SHARPNESS * distance / reach) / np.log1p(SHARPNESS)
     return np.maximum(scaled, -1.0)
 
 
 def reward_bounds(config: RewardConfig) -> tuple[float, float]:
-    """The least and the largest reward; a user's own function may return up to MAX_REWARD."""
+    """The least and the largest reward; +-MAX_REWARD for a user's own function."""
     if config.own is not None:
         return -MAX_REWARD, MAX_REWARD
     return -1.0, 1.0
 
 
 def reward_identity(config: RewardConfig) -> dict[str, Any]:
-    """The settings of a reward as processes on different machines compare them.
+    """The reward settings in a form that processes on different machines can compare.
 
-    Of a user's own reward it is the file's content that counts, not the folder that it lies in.
+    A user's own reward is identified by its file's content, not by the path.
 
     Raises:
         ConfigError: the user's file cannot be read.
@@ -163,10 +164,10 @@ def reward_identity(config: RewardConfig) -> dict[str, Any]:
 
 
 def pinned(config: RewardConfig) -> RewardConfig:
-    """The reward so that it holds in any folder, and for no other content of a user's file.
+    """The reward settings with the absolute path and the hash of a user's file.
 
     Raises:
-        ConfigError: the user's file cannot be read, or is not the one that was written down.
+        ConfigError: the user's file cannot be read, or its hash differs from the recorded one.
     """
     if config.own is None:
         return config
@@ -193,9 +194,9 @@ def _load(config: RewardConfig, path: Path, attribute: str) -> UserReward:
 def _checked(
     name: str, function: UserReward, achieved: Floats, desired: Floats, layout: Layout
 ) -> Floats:
-    """What the user's function returns, if it is one number within the bounds per row."""
+    """The output of the user's function, checked: one number within the bounds per row."""
     given = achieved.view(), desired.view()
-    for one in given:  # else `achieved -= desired` would change what is scored and learned from
+    for one in given:  # `achieved -= desired` must not change data for scores and learning
         one.flags.writeable = False
     try:
         rewards = np.asarray(function(*given, layout), dtype=np.float64)

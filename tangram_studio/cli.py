@@ -5,7 +5,7 @@ from conf.commands import Plain
 
 
 def studio() -> int:
-    """tangram-studio: a page to play on."""
+    """Serve the studio's page; returns the exit status of tangram-studio."""
     return entry("studio", _studio)
 
 
@@ -20,10 +20,10 @@ def _studio(settings: Plain) -> int:
     missing = [name for name in ("starlette", "uvicorn", "websockets") if find_spec(name) is None]
     if missing:
         raise ConfigError(
-            f"tangram-studio needs {', '.join(missing)}: in a clone type make studio, or "
+            f"tangram-studio needs {', '.join(missing)}: in a clone run make studio, or "
             "pip install -c constraints.txt '.[studio]'"
         )
-    tell("loads the agents")
+    tell("loading the agents")
 
     from tangram_studio.server import serve
 

@@ -10,5 +10,5 @@ class StudioConfig(Settings):
     """A page to play on (tangram-studio)."""
 
     port: int = setting(
-        8765, "where it listens, on this machine alone; 0 for any free port", low=0, high=65535
+        8765, "port of the page, on this machine alone; 0 for any free port", low=0, high=65535
     )

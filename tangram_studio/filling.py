@@ -1,7 +1,7 @@
-"""What a page shows -> how the seven tans fill it, or which figure of them comes nearest.
+"""Fill a page's figure with the seven tans, or find their nearest figure.
 
-A drawing goes the way of a file: it is written down and read without trust, see
-`tangram_vision.given.silhouette_files`. What no tans fill is told why, and approached.
+A drawing is written to a file, and read like any untrusted file, see
+`tangram_vision.given.silhouette_files`. If no tans fill it, the answer says why.
 
 Legend: K tokens, V corners, N rings.
 """
@@ -36,28 +36,28 @@ from tangram_vision.solving import SECONDS, answer
 from tangram_vision.solving import Answer as Answered
 
 FILES = (*READ, ".json")
-FREE_SECONDS = 1.0  # of a search where sides are not straight, so that hardly anything fits
-HEAPS = 3  # parts of a figure that is laid, at most
+FREE_SECONDS = 1.0  # for the search of a freehand drawing, which tans hardly ever fill
+HEAPS = 3  # separate groups of tans in a figure laid by a person, at most
 LAYOUT = "the layout"
-_SHOWN = 480  # pixels along the longer side of what is seen
-_ROUND = 5  # digits of what is sent
+_SHOWN = 480  # pixels along the longer side of the silhouette's picture
+_ROUND = 5  # decimal places of numbers that are sent
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """How a silhouette is filled.
+    """How the tokens fill a silhouette.
 
     Attributes:
-        goal: the tokens in the middle of the arena.
-        exact: whether they fill it; if not they come as near as was found.
-        iou: area that tokens and silhouette share over the area of both together.
-        how: it was filled, or why not.
-        seen: PNG of what was seen, a black figure.
-        size: its width and height.
-        pieces: K outlines of (V, 2), pixels of that picture, y down.
-        outline: N rings of (M, 2) of the silhouette in the arena.
-        laid: N rings of what the tokens cover.
-        solution: where the tokens lie in what was given, as data.
+        goal: poses of the tokens, in the middle of the arena.
+        exact: whether the tokens fill the silhouette; if not, they are the nearest figure found.
+        iou: intersection over union of tokens and silhouette.
+        how: how the silhouette was filled, or why not, in words.
+        seen: PNG of the silhouette in black, as a data URL.
+        size: width and height of that PNG.
+        pieces: K outlines (V, 2) of the tokens, in pixels of that PNG, y down.
+        outline: N rings (M, 2) of the silhouette, in the arena.
+        laid: N rings (M, 2) of the area that the tokens cover, in the arena.
+        solution: poses of the tokens in the given figure, as data.
     """
 
     goal: Sides
@@ -73,13 +73,13 @@ class Answer:
 
 
 def fill(asked: Fill) -> Answer:
-    """Fill what a page asks for.
+    """Fill the silhouette of a page's request.
 
     Raises:
-        ConfigError: it draws nothing that has an area, or reaches out of the arena.
+        ConfigError: the silhouette has no area, or its figure reaches out of the arena.
     """
     if sum(one is not None for one in (asked.puzzle, asked.outlines, asked.pieces)) != 1:
-        raise ConfigError("a puzzle, a drawing or pieces are to be filled, one of them")
+        raise ConfigError("a request needs exactly one of puzzle, outlines and pieces")
     layout, scale = player().layout, player().run.task.tokens.scale
     if asked.puzzle is not None:
         load_puzzle(asked.puzzle)  # a name of the library, not of a file
@@ -90,7 +90,7 @@ def fill(asked: Fill) -> Answer:
         corners = layout.corners(poses, flipped)
         heaps = len(shapely.get_parts(silhouette(layout, Dissection(poses, flipped))))
         if heaps > HEAPS:
-            raise ConfigError(f"the tans lie in {heaps} heaps: push them together until they touch")
+            raise ConfigError(f"the tans lie in {heaps} groups: move them until they touch")
         every = [corners[layout.corners_of(k)].tolist() for k in range(layout.tokens)]
         content |= {"outlines": every, "side": scale}
     with TemporaryDirectory(prefix="tangram-studio-") as folder:
@@ -101,14 +101,14 @@ def fill(asked: Fill) -> Answer:
 
 
 def fill_file(name: str, data: bytes) -> Answer:
-    """Fill what a file shows: a picture, an SVG, outlines or a puzzle as JSON.
+    """Fill the silhouette of a file: a picture, an SVG, or JSON of outlines or a puzzle.
 
     Args:
-        name: of the file; only its ending matters.
-        data: its content.
+        name: name of the file; only its ending matters.
+        data: content of the file.
 
     Raises:
-        ConfigError: it cannot be used.
+        ConfigError: the file cannot be used.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in FILES:
@@ -123,7 +123,7 @@ def fill_file(name: str, data: bytes) -> Answer:
 
 
 def tans() -> dict[str, object]:
-    """What a page is told at first: the tokens, their full square's side and area, the library."""
+    """Data for a new page: the tokens, their full square's side, their area, and the library."""
     own = player()
     layout, scale = own.layout, own.run.task.tokens.scale
     chiral = layout.chiral.tolist()
@@ -160,7 +160,7 @@ def _filled(name: str, source: str, free: bool = False) -> Answer:
     if found.exact:
         how = f"filled by the {first.by} in {first.seconds:.2f} s"
     elif free:
-        how = "Drawn by a free hand."
+        how = "Drawn freehand."
     solution = found.solution(task.layout, task.tokens.scale, source.removeprefix("the "))
     return _answer(found, how, solution)
 
@@ -184,7 +184,7 @@ def _answer(answered: Answered, how: str, solution: Solution) -> Answer:
 
 
 def _seen(drawn: Silhouette) -> tuple[str, float]:
-    """A small PNG of what was seen as an address, and the share by which it is smaller."""
+    """A small PNG of the silhouette as a data URL, and its size over that of the picture."""
     mask = Image.fromarray(np.where(drawn.mask, 0, 255).astype(np.uint8))
     share = min(1.0, _SHOWN / max(mask.size))
     mask = mask.resize([round(side * share) for side in mask.size], Image.Resampling.BOX)

@@ -1,6 +1,6 @@
-"""Processes that think and move for the pages: none can stop the server, however it ends.
+"""A pool of processes that work for the pages: no task can block or crash the server.
 
-A task is a function of what it is given, so any process can do any task, and one that is gone is
+A task depends on its arguments alone. So any process can do any task, and a process that ended is
 replaced.
 """
 
@@ -18,58 +18,58 @@ from typing import Any, TypeVar
 from tangram_core.errors import TangramError
 
 Given = TypeVar("Given")
-Waits = Callable[[int], Awaitable[None]]  # told how many tasks come first, when that changes
+Waits = Callable[[int], Awaitable[None]]  # called with the number of tasks ahead, if it changes
 LIMIT_S = 30.0  # of a task
-PATIENT_S = 0.3  # of a wait that is not worth a word
+PATIENT_S = 0.3  # a shorter wait is not reported
 
 
 class Jobs:
-    """A pool of processes, with a queue that tells who waits for how many.
+    """A pool of processes, with a queue that reports how many tasks are ahead.
 
     Attributes:
-        started: pools that were started until now.
+        started: number of pools started so far.
     """
 
     def __init__(self, processes: int, warm: Callable[[], None]) -> None:
         """Start the processes.
 
         Args:
-            processes: how many.
-            warm: what each does first, so that no task has to wait for it.
+            processes: number of processes.
+            warm: function that each process calls at its start, to load what tasks need.
         """
         self._processes, self._warm = processes, warm
         self._turns = asyncio.Semaphore(processes)
-        self._queue: list[object] = []  # who waits, the first in front
+        self._queue: list[object] = []  # waiting tasks, the next one first
         self.started = 0
         self._working: set[asyncio.Task[Any]] = set()
         self._pool = self._start()
 
     async def ready(self) -> None:
-        """Wait until the processes have begun."""
+        """Wait until the processes have started."""
         await asyncio.gather(*(self.do(os.getpid) for _ in range(self._processes)))
 
     async def do(
         self, task: Callable[..., Given], *given: object, waits: Waits | None = None
     ) -> Given:
-        """What a task makes of what it is given.
+        """Do a task in a process, and return its result.
 
         Args:
             task: a function of a module.
             given: its arguments.
-            waits: is called where others come first.
+            waits: called with the number of tasks ahead, while the task waits.
 
         Raises:
-            TangramError: the process ended, or took too long; or whatever the task raises.
+            TangramError: the process ended, or took too long; other errors are those of the task.
         """
         await self._turn(waits)
-        # Whoever asked may go: what a process has begun it ends, and until then it is not free.
+        # Shielded: if the caller is cancelled, the process is busy until its task is done.
         work = asyncio.create_task(self._work(task, given))
         self._working.add(work)
         work.add_done_callback(self._ended)
         return await asyncio.shield(work)
 
     async def _work(self, task: Callable[..., Given], given: tuple[object, ...]) -> Given:
-        """Do a task in a process, once more where that ends meanwhile; then the turn is over."""
+        """Do a task in a process, once more if the process ends; then free the turn."""
         try:
             for _ in range(2):
                 pool = self._pool
@@ -85,7 +85,7 @@ class Jobs:
                         f"it took more than {LIMIT_S:g} s: make it simpler"
                     ) from None
                 except asyncio.CancelledError:
-                    # Of another task's pool, which was ended with that; not this task.
+                    # Another task's timeout ended the pool; this task was not cancelled itself.
                     if future is None or not future.cancelled() or _is_cancelled():
                         raise
             raise TangramError("the process that worked on it ended: make it simpler")
@@ -95,7 +95,7 @@ class Jobs:
     def _ended(self, work: "asyncio.Task[Any]") -> None:
         self._working.discard(work)
         if not work.cancelled():
-            work.exception()  # heard, also where nobody waits for it any more
+            work.exception()  # counts as retrieved, also if nobody waits for it any more
 
     async def _turn(self, waits: Waits | None) -> None:
         """Wait for a process that is free."""
@@ -143,15 +143,15 @@ def _is_cancelled() -> bool:
 
 
 def _end(pool: ProcessPoolExecutor) -> None:
-    """End a pool's processes, whatever they do."""
+    """Kill a pool's processes, whatever they do."""
     for process in list((pool._processes or {}).values()):  # public from 3.14 on
         process.kill()
     pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _begin(warm: Callable[[], None]) -> None:
-    """In a new process: end with the server, however that ends, and load what is needed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's, which ends this one
+    """Set up a new process: it ends whenever the server ends, and loads what tasks need."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server handles Ctrl-C, and ends this one
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_follow, args=(parent.sentinel,), daemon=True).start()

@@ -1,6 +1,6 @@
-"""What a page asks for and is told, over its socket: JSON, checked before it is used.
+"""Messages between page and server over a socket: JSON, checked before it is used.
 
-Legend: K tokens, which are the seven tans. Lengths are in arena units, y up, unless said otherwise.
+Legend: K tokens, the seven tans. Lengths are in arena units, y up, unless said otherwise.
 """
 
 from typing import Annotated, Any, Literal
@@ -15,7 +15,7 @@ from tangram_core.errors import ConfigError
 TANS = 7
 MAX_BYTES = 2**18  # of a message
 MAX_POINTS = 4_000
-FAR = 100.0  # of a coordinate; the arena is 2 wide
+FAR = 100.0  # bound of a coordinate; the arena is 2 wide
 
 Number = Annotated[float, Meta(ge=-FAR, le=FAR)]
 Count = Annotated[int, Meta(ge=0, lt=2**53)]
@@ -28,8 +28,8 @@ class Tokens(Struct, forbid_unknown_fields=True):
     """Where the tokens lie.
 
     Attributes:
-        poses: K of x, y and angle.
-        flipped: K, which lie on their other side.
+        poses: K poses of x, y and angle.
+        flipped: K, whether a token is turned over.
     """
 
     poses: Annotated[list[tuple[Number, Number, Number]], Meta(min_length=TANS, max_length=TANS)]
@@ -37,19 +37,19 @@ class Tokens(Struct, forbid_unknown_fields=True):
 
     @property
     def sides(self) -> tuple[Floats, Bools]:
-        """Poses (K, 3) and sides (K,)."""
+        """Poses (K, 3), and whether each token is turned over (K,), as arrays."""
         return np.array(self.poses, np.float64), np.array(self.flipped, np.bool_)
 
 
 class Fill(Struct, tag_field="ask", tag="fill", forbid_unknown_fields=True):
-    """Find how the tokens fill a silhouette: one of these three.
+    """Request to fill a silhouette: exactly one of puzzle, outlines and pieces.
 
     Attributes:
-        number: of what the page asks for, given back with all answers.
-        puzzle: name of one of the library.
-        outlines: of a drawing, in any unit; an outline within another is a hole.
-        pieces: of a figure that was laid of tans, whose area is known.
-        free: the outlines were drawn by a free hand.
+        number: number of the request, repeated in all answers.
+        puzzle: name of a puzzle of the library.
+        outlines: outlines of a drawing, in any unit; one within another is a hole.
+        pieces: tans of a figure that a person laid, at their known scale.
+        free: whether the outlines were drawn freehand.
     """
 
     number: Count
@@ -60,14 +60,15 @@ class Fill(Struct, tag_field="ask", tag="fill", forbid_unknown_fields=True):
 
 
 class Play(Struct, tag_field="ask", tag="play", forbid_unknown_fields=True):
-    """Lay a figure; what is being played ends.
+    """Request to lay a figure; a figure that is being laid is given up.
 
     Attributes:
         number: see `Fill`.
         goal: the figure.
-        start: where the tokens lie; None: anywhere beside it.
-        shown: moves of the same figure that the page had begun to show; others are forgotten.
-        motion: whether tokens are carried, or pushed by a finger.
+        start: where the tokens lie; None: at random places beside the figure.
+        shown: number of moves of this figure that the page has begun to show; later ones are
+            dropped.
+        motion: lift: tokens are carried; push: a finger pushes them.
     """
 
     number: Count
@@ -78,16 +79,16 @@ class Play(Struct, tag_field="ask", tag="play", forbid_unknown_fields=True):
 
 
 class Next(Struct, tag_field="ask", tag="next", forbid_unknown_fields=True):
-    """Play one more move: the page asks while it shows the one before."""
+    """Request for one more move; a page sends it while it shows the move before."""
 
 
 class Save(Struct, tag_field="ask", tag="save", forbid_unknown_fields=True):
-    """Send what was played as a file.
+    """Request for a file of what was played.
 
     Attributes:
-        kind: gif, of all moves; svg, of the tokens as they lie; json, a puzzle file of the figure.
-        tokens: as they lie.
-        name: of the figure.
+        kind: gif: all moves; svg: the tokens as they lie; json: a puzzle file of the figure.
+        tokens: where the tokens lie.
+        name: name of the figure.
         shown: see `Play`.
     """
 
@@ -102,18 +103,18 @@ _DECODER = msgspec.json.Decoder(Asked)
 
 
 def read(text: str | bytes) -> Asked:
-    """A page's message.
+    """Decode a page's message.
 
     Raises:
-        ConfigError: it is none, or something in it is out of bounds.
+        ConfigError: the text is no message, or a value in it is out of bounds.
     """
     try:
         asked: Asked = _DECODER.decode(text)
     except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
-        raise ConfigError(f"the page's message is not understood ({error}): load it anew") from None
+        raise ConfigError(f"cannot read the page's message ({error}): reload the page") from None
     return asked
 
 
 def write(told: str, **content: Any) -> str:
-    """A message to a page."""
+    """Encode a message to a page."""
     return msgspec.json.encode({"told": told, **content}).decode()

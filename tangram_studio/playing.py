@@ -1,10 +1,10 @@
-"""One move after the other: an agent chooses a token and a motion, the engine moves it.
+"""Play single moves: an agent chooses a token and a motion, and the engine moves the token.
 
-Tokens are carried by one agent, or pushed by a finger, which another one leads.
+One agent carries tokens. Another one leads a finger that pushes them.
 
-Nothing is kept between two moves but what is given, and the pushes of the last round: a page may
-change the scene at any time.
-"Placed" is what lies in its piece: what was dragged or pushed away is moved again.
+A page may change the scene at any time. So a move depends only on its arguments, and on the pushes
+of the last round. A token is "placed" if it lies in its piece. A token that was dragged or pushed
+away is moved again.
 
 Legend: K tokens, F frames.
 """
@@ -32,14 +32,14 @@ from tangram_tasks.push.places import push_of
 from tangram_tasks.push.task import Push
 
 AGENT, FINGER = "pretrained/tangram7", "pretrained/hand"
-PARTS = 20  # of a push, as it is shown
-_NEAR, _STRAIGHT = 0.01, 0.03  # arena units and radians: what lies in its piece
-_STILL = 1e-3  # what moved less has not moved
+PARTS = 20  # steps of a push that a page shows
+_NEAR, _STRAIGHT = 0.01, 0.03  # a token this near to its piece (arena units, radians) is placed
+_STILL = 1e-3  # a token that moved less has not moved
 _SEEDS = 2**31
 
 
 class Sides(NamedTuple):
-    """Poses (K, 3), and (K,) which tokens lie on their other side."""
+    """Poses (K, 3) of tokens, and whether each is turned over (K,)."""
 
     poses: Floats
     flipped: Bools
@@ -47,17 +47,17 @@ class Sides(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """What one move came to.
+    """The result of one move.
 
     Attributes:
-        token: that was moved; None where none was.
-        frames: (F, K, 3) poses at equal times of a second, the first before it and the last after.
-        finger: (F, 2) where it is then, where one pushes.
-        blocked: the token could not be set down on others, and lies where it was.
-        coverage: share of the figure that is covered after it.
-        iou: area that tokens and figure share over the area of both together.
-        done: tokens that were moved in this round, this one among them.
-        ended: no token has an action left in this round.
+        token: index of the token that was moved; None if none was.
+        frames: (F, K, 3) poses at equal time steps, from before the move to after it.
+        finger: (F, 2) places of the finger at these times; None if tokens are carried.
+        blocked: whether other tokens were in the way, so that the token lies where it was.
+        coverage: share of the figure that is covered after the move.
+        iou: intersection over union of tokens and figure after the move.
+        done: tokens that were moved in this round, this one included.
+        ended: whether no token has an action left in this round.
     """
 
     token: int | None
@@ -71,10 +71,10 @@ class Move:
 
 
 class _Player:
-    """Who carries tokens, and the arena."""
+    """The agent that carries tokens, and its arena."""
 
     def __init__(self) -> None:
-        torch.set_num_threads(1)  # more are slower for so little, above all beside other work
+        torch.set_num_threads(1)  # more threads are slower for so small a network
         self.run: Run = load_run(AGENT)
         self.layout = self.run.task.layout
         sim = replace(self.run.task.sim.blind, starts="outside")
@@ -82,7 +82,7 @@ class _Player:
 
 
 class _Finger:
-    """Who pushes them, on a table whose friction it is not told."""
+    """The agent that pushes tokens, on a table of unknown friction."""
 
     def __init__(self) -> None:
         torch.set_num_threads(1)
@@ -93,15 +93,15 @@ class _Finger:
             self._unknowns = env.unknowns[0]
         self._table = PushTable(self._task.layout, self._task.config.finger)
         self.most = self._task.spec.horizon
-        self._made = list[tuple[Floats, Singles]]()  # corners before each push of a round, and it
+        self._made = list[tuple[Floats, Singles]]()  # corners before each push of a round, the push
 
     def push(self, scene: Sides, goal: Sides, made: int) -> tuple[int, Floats, Floats] | None:
-        """Which token, frames (F, K, 3), and the finger's places (F, 2).
+        """The next push: token, frames (F, K, 3), and places of the finger (F, 2).
 
-        None where all lie in their places, or the finger cannot come down. The pushes that were
-        made in this round are known, so none that did nothing is made again.
+        None if all tokens are placed, or if the finger cannot come down. The agent knows the pushes
+        of this round, so it does not repeat a push that had no effect.
 
-        No push turns a token over: with one that lies on its other side, all is done in a mirror.
+        No push turns a token over. If one is turned over, the push is computed in a mirror image.
         """
         layout, config = self._task.layout, self._task.config
         image = bool((scene.flipped & layout.chiral).any())
@@ -131,21 +131,21 @@ class _Finger:
 
 @lru_cache(maxsize=1)
 def player() -> _Player:
-    """Who carries tokens."""
+    """The agent that carries tokens, loaded once."""
     return _Player()
 
 
 @lru_cache(maxsize=1)
 def finger() -> _Finger:
-    """Who pushes them."""
+    """The agent that pushes tokens, loaded once."""
     return _Finger()
 
 
 def begin(goal: Sides, seed: int) -> Floats:
-    """(K, 3) where the tokens lie at first, anywhere beside the figure.
+    """(K, 3) random poses of the tokens beside the figure.
 
     Raises:
-        SamplingError: they find no room.
+        SamplingError: there is no room for the tokens.
     """
     env = player().env
     env.reset([np.random.default_rng(seed % _SEEDS)], (goal.poses[None], goal.flipped[None]))
@@ -154,14 +154,14 @@ def begin(goal: Sides, seed: int) -> Floats:
 
 
 def next_move(scene: Sides, goal: Sides, motion: str, done: tuple[int, ...]) -> Move:
-    """The next move.
+    """The next move towards a figure.
 
     Args:
         scene: the tokens as they lie.
         goal: the figure.
-        motion: carried or pushed.
-        done: tokens that were moved in this round: each is carried once in it, and pushed until
-            the round has as many pushes as an episode.
+        motion: lift to carry a token, push to push it.
+        done: tokens that were moved in this round. A round carries each token once, or has as many
+            pushes as an episode.
     """
     return (_push if motion == "push" else _carry)(scene, goal, done)
 
@@ -207,7 +207,7 @@ def _scores(scene: Sides, goal: Sides) -> tuple[float, float]:
 
 
 def _placed(scene: Sides, goal: Sides) -> Bools:
-    """(K,) tokens that lie in their pieces."""
+    """(K,) whether a token lies in its piece."""
     layout = player().layout
     here, there = (layout.corners(one.poses, one.flipped)[None] for one in (scene, goal))
     pairing = paired(layout, here, there)

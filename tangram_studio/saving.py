@@ -1,4 +1,4 @@
-"""What was played as a file: a GIF of its moves, an SVG of the tokens, a puzzle file.
+"""Files of what was played: a GIF of the moves, an SVG of the tokens, or a puzzle file.
 
 Legend: K tokens, F frames, V corners.
 """
@@ -20,16 +20,16 @@ from tangram_sim.puzzles.figures import parse_puzzles
 from tangram_sim.puzzles.sketches import FORMAT, VERSION
 from tangram_studio.playing import Move, Sides, player
 
-FRAMES = 10  # of a move: a GIF shows 20 in a second, and twice as fast as the page
+FRAMES = 10  # of a move: at 20 frames a second a GIF is twice as fast as the page
 FRAME_MS = 50
-MOVES = 60  # that a GIF shows, the last ones
+MOVES = 60  # moves in a GIF, the last ones
 _PIXELS, _STILL = 360, 20
 _DIGITS = 6
 _SVG = 500  # pixels
 
 
 def gif(moves: Sequence[Move], goal: Sides) -> bytes:
-    """The moves as an animation.
+    """An animated GIF of the moves.
 
     Raises:
         ConfigError: nothing was played.
@@ -68,7 +68,7 @@ def _shown(move: Move) -> list[tuple[Floats, Held | None]]:
 
 
 def svg(tokens: Sides) -> bytes:
-    """The tokens as they lie, a polygon each, y down."""
+    """An SVG of the tokens as they lie, with a polygon for each."""
     own = player()
     layout, half = own.layout, own.run.task.sim.arena / 2.0
     lines = [
@@ -83,10 +83,10 @@ def svg(tokens: Sides) -> bytes:
 
 
 def puzzle_file(tokens: Sides, name: str) -> bytes:
-    """The tokens as they lie as a puzzle, which tangram-play and tangram-eval take.
+    """A puzzle file of the tokens as they lie, for tangram-play and tangram-eval.
 
     Raises:
-        ConfigError: they are no figure, as where they lie on each other.
+        ConfigError: the tokens are no figure, for example because they overlap.
     """
     own = player()
     layout, scale = own.layout, own.run.task.tokens.scale
@@ -97,7 +97,7 @@ def puzzle_file(tokens: Sides, name: str) -> bytes:
     content = {"format": FORMAT, "version": VERSION, "puzzles": [{"name": name, "pieces": pieces}]}
     text = json.dumps(content)
     try:
-        parse_puzzles(text, "the figure")  # what nobody could read is not saved
+        parse_puzzles(text, "the figure")  # a file that cannot be read again is not saved
     except ConfigError as error:
         first = str(error).partition(";")[0]
         raise ConfigError(f"this is no puzzle, and was not saved: {first}") from None

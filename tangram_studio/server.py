@@ -1,4 +1,4 @@
-"""The server of the page: on this machine alone, and for those alone who have its token."""
+"""The web server of the page: on this machine alone, and only for browsers with its token."""
 
 import asyncio
 import logging
@@ -31,9 +31,9 @@ from tangram_studio.playing import finger, player
 from tangram_studio.session import LOST, Session, plain
 
 HOST = "127.0.0.1"
-PAGES = 64  # at once
+PAGES = 64  # open pages, at most
 BACKLOG = 128
-COUNT_S = 0.2  # that pages may take to hear how many there are
+COUNT_S = 0.2  # time to tell all pages how many are open
 MAX_UPLOAD = 10 * 10**6  # bytes
 STATIC = files("tangram_studio") / "static"
 TYPES = {
@@ -42,7 +42,7 @@ TYPES = {
     ".css": "text/css",
     ".svg": "image/svg+xml",
 }
-# Nothing of another host, nothing within another's page.
+# A page loads nothing from other hosts, and cannot be embedded in their pages.
 GUARDS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' data: blob:; connect-src 'self'; form-action 'none'; base-uri 'none'; "
@@ -55,28 +55,30 @@ NOT_LET_IN = (
     "This page needs its token: open the address that tangram-studio printed in its terminal, with "
     "?token=... at its end. Each start of tangram-studio has a new one.\n"
 )
-WRONG_HOST = "This server answers to this machine's own names alone: open the printed address.\n"
-FULL = 4429  # codes of a socket that is closed
+WRONG_HOST = (
+    "The studio answers only under this machine's own names: open the address that it printed.\n"
+)
+FULL = 4429  # close codes of a socket
 SHUT = 4403
 NO_BYTES = 1003
 UPLOADS = 8  # at once
-UPLOAD_S = 60.0  # that one may take to come
+UPLOAD_S = 60.0  # time limit of an upload
 OPEN = 512  # connections at once
-HEAD_S = 10.0  # that the head of a request may take to come
+HEAD_S = 10.0  # time limit for the head of a request
 
 log = logging.getLogger(__name__)
 
 
 class Door:
-    """Lets nobody in who does not show the token, nor what another site's page sends."""
+    """ASGI app that refuses requests without the token, and those from pages of other sites."""
 
     def __init__(self, app: ASGIApp, token: str, port: int) -> None:
-        """Stand before an app."""
+        """Guard an app."""
         self._app, self._token, self._cookie = app, token, f"tangram_studio_{port}"
         self._hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """As ASGI."""
+        """Pass a request on to the app, or refuse it."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -90,7 +92,7 @@ class Door:
             await answer(scope, receive, partial(_guarded, send))
 
     def _checked(self, scope: Scope) -> Response | None:
-        """What is answered in place of the app; None: come in."""
+        """The answer in place of the app's; None if the request may pass."""
         headers = Headers(scope=scope)
         if headers.get("host") not in self._hosts:
             return PlainTextResponse(WRONG_HOST, 403)
@@ -99,7 +101,7 @@ class Door:
             return PlainTextResponse(WRONG_HOST, 403)
         given = QueryParams(scope["query_string"]).get("token")
         if given is not None and self._is_token(given) and scope["type"] == "http":
-            # The token leaves the address: it is neither seen over a shoulder nor kept in history.
+            # Remove the token from the address, so that nobody reads it there or in the history.
             inside = RedirectResponse("/", 303)
             inside.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
             return inside
@@ -119,7 +121,7 @@ async def _guarded(send: Send, message: Message) -> None:
 
 
 def _cookies(headers: Headers, name: str) -> Iterator[str]:
-    """The values of a cookie; others are of other programs of this machine, in whatever form."""
+    """The values of a cookie; other programs of this machine set cookies, too, in any form."""
     for one in ";".join(headers.getlist("cookie")).split(";"):
         key, _, value = one.partition("=")
         if key.strip() == name:
@@ -127,27 +129,27 @@ def _cookies(headers: Headers, name: str) -> Iterator[str]:
 
 
 class Prompt(H11Protocol):
-    """HTTP that closes a connection which keeps it waiting for the head of a request."""
+    """HTTP protocol that closes a connection if the head of a request takes too long."""
 
     _waits: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Wait for the first."""
+        """Start the timer for the first request."""
         super().connection_made(transport)
         self._wait()
 
     def on_response_complete(self) -> None:
-        """Wait for another."""
+        """Start the timer for the next request."""
         super().on_response_complete()
         self._wait()
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """A page's socket may be silent."""
+        """Stop the timer, as a page's socket may be silent."""
         self._wait(0.0)
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait for nothing."""
+        """Stop the timer."""
         self._wait(0.0)
         super().connection_lost(exc)
 
@@ -163,10 +165,10 @@ class Prompt(H11Protocol):
 
 
 class Studio:
-    """What the pages share."""
+    """The handlers of requests, and what all pages share."""
 
     def __init__(self) -> None:
-        """Start the processes that think, half of the machine's cores for what takes long."""
+        """Start two pools, for slow work and for moves, each with half of the machine's cores."""
         many = max(1, (os.cpu_count() or 2) // 2)
         self.fills, self.moves = Jobs(many, warm), Jobs(many, warm)
         self._pages: set[WebSocket] = set()
@@ -175,7 +177,7 @@ class Studio:
 
     @asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        """The processes live as long as the server."""
+        """Keep the processes running as long as the server runs."""
         first = [asyncio.create_task(jobs.ready()) for jobs in (self.fills, self.moves)]
         try:
             yield
@@ -186,7 +188,7 @@ class Studio:
             self.moves.close()
 
     async def play(self, socket: WebSocket) -> None:
-        """A page's socket."""
+        """Serve the socket of one page."""
         await socket.accept()
         if len(self._pages) >= PAGES:
             await socket.close(FULL)
@@ -203,7 +205,7 @@ class Studio:
                     await socket.close(NO_BYTES)
                     break
                 await session.hear(message["text"])
-        except (WebSocketDisconnect, RuntimeError):  # it is going
+        except (WebSocketDisconnect, RuntimeError):  # the page is leaving
             pass
         finally:
             self._pages.discard(socket)
@@ -211,7 +213,7 @@ class Studio:
             await self._count()
 
     async def _count(self) -> None:
-        """Tell all pages how many there are, none waiting for one that does not listen."""
+        """Tell all pages how many are open; a page that does not listen delays no other."""
         text = write("pages", count=len(self._pages))
         telling = {asyncio.create_task(_told(page, text)) for page in self._pages}
         if telling:
@@ -220,7 +222,7 @@ class Studio:
             task.cancel()
 
     async def figures(self, _: Request) -> Response:
-        """The tokens, and the library."""
+        """Answer with the tokens and the library."""
         if self._tans is None:
             try:
                 self._tans = await self.fills.do(tans)
@@ -229,30 +231,30 @@ class Studio:
         return JSONResponse(self._tans)
 
     async def drop(self, request: Request) -> Response:
-        """A file that was dropped on the page."""
+        """Fill a file that was dropped on the page."""
         size = request.headers.get("content-length", "")
         if not size.isdecimal() or int(size) > MAX_UPLOAD:
             limit = MAX_UPLOAD // 10**6
             return _refused(f"the file is larger than {limit} MB: make it smaller", 413)
         if self._uploads >= UPLOADS:
-            return _refused("others' files are looked at first: drop it again in a moment", 429)
+            return _refused("too many files are waiting: drop it again in a moment", 429)
         self._uploads += 1
         try:
             async with asyncio.timeout(UPLOAD_S):
                 data = await request.body()
             return await self._seen(request, data)
         except TimeoutError:
-            return _refused(f"the file did not come within {UPLOAD_S:g} s: drop it again", 408)
+            return _refused(f"the file did not arrive within {UPLOAD_S:g} s: drop it again", 408)
         except ClientDisconnect:
-            return Response(status_code=400)  # nobody hears it
-        except Exception:  # a page must hear of everything
-            log.exception("a file was not filled")
+            return Response(status_code=400)  # nobody reads it
+        except Exception:  # a page must learn of every failure
+            log.exception("filling a dropped file failed")
             return _refused(LOST, 500)
         finally:
             self._uploads -= 1
 
     async def _seen(self, request: Request, data: bytes) -> Response:
-        """How a file is filled, unless its sender leaves."""
+        """Fill a file, and give up if its sender leaves."""
         name = request.query_params.get("name", "")
         looks = asyncio.create_task(self.fills.do(fill_file, name, data))
         leaves = asyncio.create_task(_left(request))
@@ -268,19 +270,19 @@ class Studio:
 
 
 async def _left(request: Request) -> None:
-    """Return when whoever asked has left."""
+    """Return when the sender of a request has left."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
 
 def warm() -> None:
-    """Load what every process needs."""
+    """Load the agents, which every process needs."""
     player()
     finger()
 
 
 async def _told(page: WebSocket, text: str) -> None:
-    with suppress(WebSocketDisconnect, RuntimeError):  # it is going
+    with suppress(WebSocketDisconnect, RuntimeError):  # the page is leaving
         await page.send_text(text)
 
 
@@ -297,7 +299,7 @@ def _refused(why: str, status: int) -> Response:
 
 
 def make_app(token: str, port: int) -> ASGIApp:
-    """The app of a studio behind its door."""
+    """The ASGI app of a studio, guarded by its token."""
     studio = Studio()
     routes = [
         Route("/", _file),
@@ -322,7 +324,7 @@ def serve(config: StudioConfig) -> int:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((HOST, config.port))
-        listener.listen(BACKLOG)  # who comes before it has begun waits
+        listener.listen(BACKLOG)  # from now on pages wait until the server has started
     except OSError as error:
         listener.close()
         raise ConfigError(
@@ -334,8 +336,8 @@ def serve(config: StudioConfig) -> int:
     address = f"http://{HOST}:{port}/?token={token}"
     print(f"tangram-studio is at {address}", flush=True)  # noqa: T201
     print(  # noqa: T201
-        f"on this machine alone; from another: ssh -L {port}:{HOST}:{port} THIS_MACHINE, then the "
-        "same address there. Ctrl-C ends it.",
+        f"Only this machine can open it. On another one: ssh -L {port}:{HOST}:{port} THIS_MACHINE, "
+        "then open the same address there. Ctrl-C ends tangram-studio.",
         flush=True,
     )
     logging.basicConfig(format="%(asctime)s tangram-studio: %(message)s", datefmt="%H:%M:%S")

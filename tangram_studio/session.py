@@ -1,4 +1,4 @@
-"""One page's conversation: the newest that it asks for is done, instead of what was before."""
+"""The conversation with one page: its newest request replaces the one before."""
 
 import asyncio
 import logging
@@ -17,10 +17,10 @@ from tangram_studio.jobs import Jobs
 from tangram_studio.messages import Fill, Next, Play, Save, read, write
 from tangram_studio.playing import Move, Sides
 
-ROUNDS = 5  # of a figure that is not laid yet: an agent that gets nowhere ends, too
+ROUNDS = 5  # of a figure, at most, so that an agent without success ends, too
 LAID = 0.95  # IoU from which a figure counts as laid
 _KINDS = {"gif": "image/gif", "svg": "image/svg+xml", "json": "application/json"}
-LOST = "something went wrong here that should not: the terminal of tangram-studio says what"
+LOST = "an internal error: the terminal of tangram-studio shows it"
 
 log = logging.getLogger(__name__)
 
@@ -31,11 +31,11 @@ class Game:
 
     Attributes:
         goal: the figure.
-        motion: whether tokens are carried, or pushed by a finger.
+        motion: lift: tokens are carried; push: a finger pushes them.
         scene: the tokens as they lie.
         done: tokens that were moved in this round.
-        rounds: before it.
-        moved: whether anything was moved in it.
+        rounds: number of rounds before this one.
+        moved: whether a token was moved in this round.
     """
 
     goal: Sides
@@ -46,7 +46,7 @@ class Game:
     moved: bool = False
 
     def goes_on(self, move: Move) -> bool:
-        """Whether there is more to try after a move of no token: the next action, or a round."""
+        """Whether to go on after a move of no token, with the next action or the next round."""
         if not move.ended:
             self.done = move.done
             return True
@@ -57,7 +57,7 @@ class Game:
 
 
 class Session:
-    """A page that is connected."""
+    """A connected page."""
 
     def __init__(
         self,
@@ -66,25 +66,25 @@ class Session:
         fills: Jobs,
         moves: Jobs,
     ) -> None:
-        """Begin.
+        """Open the conversation.
 
         Args:
             tell: sends a message to the page.
-            give: sends a file.
-            fills: do what takes long.
-            moves: do what must not wait for it.
+            give: sends a file to the page.
+            fills: pool for slow work.
+            moves: pool for moves, which must not wait for slow work.
         """
         self._tell, self._give, self._fills, self._moves = tell, give, fills, moves
         self._game: Game | None = None
         self._goal: Sides | None = None
-        self._played: list[Move] = []  # of this figure, what was interrupted among them
+        self._played: list[Move] = []  # of this figure, also before an interruption
         self._sent = 0  # moves of this figure; a page may not have shown the last ones
         self._number = 0
         self._doing: asyncio.Task[None] | None = None
         self._saving: asyncio.Task[None] | None = None
 
     async def hear(self, text: str | bytes) -> None:
-        """Begin what a message asks for; what was being done before ends."""
+        """Handle a message: a request replaces the one before it, a save runs beside it."""
         try:
             asked = read(text)
         except TangramError as error:
@@ -97,13 +97,13 @@ class Session:
             self._saving = asyncio.create_task(self._save(asked))
             return
         if isinstance(asked, Next) and self._doing is not None and not self._doing.done():
-            return  # it is on its way
+            return  # the move is being made already
         await _ended(self._doing)
         self._number = self._number if isinstance(asked, Next) else asked.number
         self._doing = asyncio.create_task(self._do(asked))
 
     async def end(self) -> None:
-        """End what is being done."""
+        """End all work for the page."""
         for task in (self._doing, self._saving):
             await _ended(task)
 
@@ -112,7 +112,7 @@ class Session:
             await self._answer(asked)
         except TangramError as error:
             await self._say("refused", why=str(error))
-        except Exception:  # a page must hear of everything
+        except Exception:  # a page must learn of every failure
             log.exception("a page's %s failed", type(asked).__name__.lower())
             await self._say("refused", why=LOST)
 
@@ -175,7 +175,7 @@ class Session:
         )
 
     def _seen(self, shown: int) -> list[Move]:
-        """What was played, without moves that the page was sent and has not begun to show."""
+        """The moves played, without those that the page has not begun to show."""
         unseen = max(self._sent - shown, 0)
         return self._played[: max(len(self._played) - unseen, 0)]
 
@@ -188,7 +188,7 @@ class Session:
             data = await self._fills.do(_saved, asked, self._seen(asked.shown), self._goal)
         except TangramError as error:
             await self._tell(write("unsaved", why=str(error)))
-        except Exception:  # a page must hear of everything
+        except Exception:  # a page must learn of every failure
             log.exception("a page's save failed")
             await self._tell(write("unsaved", why=LOST))
         else:
@@ -212,7 +212,7 @@ def _saved(asked: Save, moves: list[Move], goal: Sides | None) -> bytes:
 
 
 def plain(answer: Answer) -> dict[str, Any]:
-    """How a silhouette is filled, as a page is told."""
+    """An answer as plain data, for JSON."""
     goal = {"poses": answer.goal.poses.round(6).tolist(), "flipped": answer.goal.flipped.tolist()}
     solution = msgspec.to_builtins(answer.solution)
     return vars(answer) | {"goal": goal, "solution": solution}

@@ -20,18 +20,18 @@ from tangram_sim.world.world import no_opencv
 if TYPE_CHECKING:
     from tangram_tasks.place import Place
 
-PIXELS = 64  # of a picture's side in tests, where training takes none
+PIXELS = 64  # side of the pictures in tests, if training takes none
 
 
 class PlaceEnv(Env):
-    """B worlds of tokens.
+    """B simulated worlds of tokens, for task=place and task=fill.
 
     Attributes:
-        world: what plays.
+        world: the worlds.
     """
 
     def __init__(self, task: "Place", count: int, purpose: Purpose) -> None:
-        """Open the worlds; to test, their camera is on, but where outlines are shown."""
+        """Open the worlds; purpose `test` turns the camera on, unless agents see outlines."""
         self.count = count
         shown = task.sim.observe == "silhouette"
         if purpose == "test" and not shown and not task.sim.pixels:
@@ -57,8 +57,8 @@ class PlaceEnv(Env):
         world = self.world
         seen: dict[str, Array] = {"corners": world.seen, "placed": world.placed}
         if world.sight is not None:
-            # Of several tokens one may have left the picture; alone it would be all there is to
-            # be seen.
+            # One of several tokens may have left the picture and counts as seen; a single token
+            # outside of the picture does not.
             several = world.layout.tokens > 1
             seen["seen"] = ~world.sight.missing | (world.sight.away & several)
             seen["closed"] = world.closed
@@ -66,7 +66,7 @@ class PlaceEnv(Env):
         return seen | {"goals": world.seen_goals}
 
     def facts(self) -> Arrays:
-        """Exact corners and goals, overlap, refused and blocked actions, and what cameras took."""
+        """Exact corners and goals, overlap, refused and blocked actions, and what cameras saw."""
         world, result, none = self.world, self._result, np.zeros(self.count, np.bool_)
         facts: dict[str, Array] = {
             "corners": world.corners,
@@ -83,7 +83,7 @@ class PlaceEnv(Env):
         return facts
 
     def told(self) -> Json:
-        """The overlap, whether that solves it, Eq. 14 of pictures, and why nothing moved."""
+        """Coverage, success, reward by pictures (Eq. 14), and why nothing moved."""
         from tangram_tasks.metrics import SOLVED  # noqa: PLC0415  # scipy, which no worker needs
 
         world, result = self.world, self._result
@@ -104,7 +104,7 @@ class PlaceEnv(Env):
         return info
 
     def picture(self, size: int) -> Pixels:
-        """Tokens and target of the first world, the last mover marked."""
+        """Draw tokens and target of the first world; the token that moved last is marked."""
         from tangram_sim.drawing.scenes import draw_scene  # noqa: PLC0415
 
         world, moved = self.world, None if self._result is None else int(self._result.tokens[0])
@@ -117,7 +117,7 @@ class PlaceEnv(Env):
 
 
 def make_eye(task: "Place") -> Eye | None:
-    """What finds the tokens of a task in pictures; None where corners are observed.
+    """The function that finds tokens in pictures; None if agents see no pictures.
 
     Raises:
         ConfigError: OpenCV is not installed.
@@ -125,9 +125,9 @@ def make_eye(task: "Place") -> Eye | None:
     if not task.sim.looks:
         return None
     try:
-        # Only here: most workers look at nothing, and its import takes time and memory.
+        # Imported here: it takes time and memory, and most workers see no pictures.
         from tangram_vision.pictures.seeing import see  # noqa: PLC0415
-    except ImportError as error:  # also a library that OpenCV needs in its turn
+    except ImportError as error:  # OpenCV, or a library that it needs
         raise no_opencv(str(error)) from error
     layout, arena = task.layout, task.sim.arena
 

@@ -1,4 +1,4 @@
-"""Tokens fill an outline; which piece goes where is not told."""
+"""Task `fill`: tokens fill an outline whose pieces are hidden."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -25,20 +25,20 @@ _SOLVED = Score("solved", "solved (IoU 0.95)")
 
 @dataclass(frozen=True)
 class Fill(Place):
-    """A token goes where it is taken, once, from outside of the outline."""
+    """Each token starts outside of the outline and is set down once."""
 
     agent: ClassVar[str] = "outline"
     outlines: ClassVar[bool] = True
 
     @property
     def scores(self) -> tuple[Score, ...]:  # type: ignore[override]
-        """Nothing of where a piece should lie: any dissection counts."""
+        """Scores of areas only: any dissection of the outline counts."""
         own = {score.name: score for score in SEVERAL} | {_SOLVED.name: _SOLVED}
         return tuple(own[name] for name in _AREAS)
 
     def rewards(self, achieved: Array, desired: Array) -> Floats:
-        """(n,) Eq. 14 of corners (n, V, 2) and of outlines as rows (n, G, 2)."""
-        # Only here: no worker asks, and shapely takes its time.
+        """Rewards (n,) by Eq. 14, of corners (n, V, 2) and outlines (n, G, 2)."""
+        # Imported here: shapely loads slowly, and workers do not need it.
         import shapely  # noqa: PLC0415
 
         from tangram_sim.geometry.overlap import outlines  # noqa: PLC0415
@@ -50,7 +50,7 @@ class Fill(Place):
         return scaled_overlap(np.clip(shared / self.layout.areas.sum(), 0.0, 1.0))
 
     def score(self, played: Played) -> dict[str, float]:
-        """Those of areas; a figure is solved by what it shares with its outline."""
+        """Compute the scores of areas; a figure is solved if its IoU is at least `SOLVED`."""
         from tangram_tasks.metrics import SOLVED, assembled  # noqa: PLC0415  # scipy
         from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
 
@@ -59,16 +59,16 @@ class Fill(Place):
         return {name: every[name] for name in _AREAS}
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """Chance; where no piece is told, no formula knows where to go."""
+        """Random play alone: the formula would need the hidden pieces."""
         return {"random": super().rivals()["random"]}
 
     def __post_init__(self) -> None:
-        """Refuse a game in which a token does not go where it is taken, once.
+        """Refuse settings that do not move each token exactly once, from outside.
 
         Raises:
             ConfigError: names the setting and the remedy.
         """
-        if self.layout.tokens == 1:  # before the set's own remedies, which lead here
+        if self.layout.tokens == 1:  # before the checks of `Place`, whose remedies lead here
             raise ConfigError(
                 f"tokens={self.layout.shapes[0].name}: task=fill needs a set of several tokens: "
                 "set tokens=tangram7, or task=place"
@@ -89,10 +89,10 @@ class Fill(Place):
             given = getattr(sim, name)
             if given != value:
                 raise ConfigError(
-                    f"sim.{name}={told(given)}: in task=fill a token goes where it is taken, once, "
+                    f"sim.{name}={told(given)}: in task=fill each token is set down once, "
                     f"from outside: set sim.{name}={told(value)}"
                 )
         for own in fields(RewardConfig):
             if getattr(self.reward, own.name) != own.default:
                 given = f"reward.{own.name}={told(getattr(self.reward, own.name))}"
-                refuse_ignored(given, "task=fill, which pays for what is covered", "set task=place")
+                refuse_ignored(given, "task=fill, which always pays for coverage", "set task=place")

@@ -24,32 +24,33 @@ from tangram_tasks.push.task import Push, PushConfig
 
 Observation = dict[str, Any]  # of float64 vectors
 
-MAX_SIDE = 4096  # of a picture, pixels
-# The square tan has a quarter of the full square's diagonal as its side: this makes it 0.4.
+MAX_SIDE = 4096  # pixels, of a rendered picture
+# The side of the square tan is a quarter of the full square's diagonal; this makes it 0.4.
 SQUARE_SCALE = 0.8 * 2.0**0.5
 
 
 class TaskEnv(gymnasium.Env[Observation, Singles]):
-    """One environment of a task.
+    """A gymnasium goal environment of one task.
 
-    Observations are a dict of float64 vectors: `achieved_goal`, `desired_goal`, and in
-    `observation` all fields of the task's spec but the goal, one after the other. Entries of an
-    action beyond [-1, 1] count as the bound. An episode that does not terminate is truncated after
-    `task.spec.horizon` steps. `info` has `is_success`, and what the task tells of the step.
+    Observations are a dict of float64 vectors: `achieved_goal`, `desired_goal` and `observation`.
+    The last one concatenates all other fields of the task's spec. Actions are clipped to [-1, 1].
+    An episode that does not terminate is truncated after `task.spec.horizon` steps. `info` has
+    `is_success` and the entries of `Env.told`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
 
     def __init__(self, task: Task, render_mode: str | None = None, render_size: int = 240) -> None:
-        """Make the world.
+        """Make the environment.
 
         Args:
-            task: what is played, such as `load_run(...).setup.task`.
+            task: the task to play, such as `load_run(...).setup.task`.
             render_mode: None or rgb_array.
             render_size: side of the rendered picture in pixels.
 
         Raises:
-            ConfigError: a setting that cannot work.
+            ConfigError: an argument is out of its range, or the task cannot be played.
+            SamplingError: the tokens do not fit.
         """
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode must be None or rgb_array, got '{render_mode}'")
@@ -80,7 +81,11 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; a seed fixes this one and all that follow; SamplingError: no room."""
+        """Begin an episode; a seed makes this and all later episodes repeatable.
+
+        Raises:
+            SamplingError: the tokens find no room to start.
+        """
         super().reset(seed=seed, options=options)
         seen = self._env.reset([self.np_random])
         self._steps, self._ended = 0, False
@@ -90,12 +95,14 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         """Play one action of shape (A,).
 
         Raises:
-            ValueError: wrong shape, or not finite.
+            ValueError: the action has another shape or is not finite.
             RuntimeError: the episode is over, or none was begun.
         """
         spec, size = self.task.spec, self.task.spec.action_size
         if self._ended or self._steps >= spec.horizon:
-            raise RuntimeError(f"no episode of {spec.horizon} steps goes on: call reset first")
+            raise RuntimeError(
+                f"the episode of {spec.horizon} steps is over or was not begun: call reset first"
+            )
         given = np.asarray(action, np.float32)
         if given.shape != (size,) or not np.isfinite(given).all():
             raise ValueError(f"an action must be {size} finite numbers, got {action!r}")
@@ -106,28 +113,28 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         return self._observation(step.seen), float(step.rewards[0]), self._ended, cut, info
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:  # noqa: ARG002 - goal environments have it
-        """Of one achieved and one desired goal a float, of n of each their rewards (n,).
+        """Compute the reward of one pair of goals as a float, or of n pairs as (n,).
 
-        A step's reward may be measured on pictures; this one is measured on the corners that are
-        seen, so with pictures both differ by a little.
+        With pictures, a step's own reward is measured on the pictures. This one is measured on the
+        observed corners, so both differ a little.
         """
         rewards: Floats = self.task.rewards(*self._goals(achieved_goal, desired_goal))
         return float(rewards[0]) if np.ndim(achieved_goal) == 1 else rewards
 
     def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:  # noqa: ARG002
-        """Whether the last step would have ended the episode, for one goal or for n."""
+        """Whether a step with these goals terminates: a bool, or (n,) for n pairs of goals."""
         achieved, desired = self._goals(achieved_goal, desired_goal)
         recorded = np.full(len(achieved), self._ended)
         ended: Bools = self.task.ended(achieved, desired, recorded)
         return bool(ended[0]) if np.ndim(achieved_goal) == 1 else ended
 
     def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Whether the time is over and the goal is not reached, for one goal or for n."""
+        """Whether the time limit is reached without termination: a bool, or (n,) for n pairs."""
         ended = self.compute_terminated(achieved_goal, desired_goal, info)
         return np.logical_not(ended) & (self._steps >= self.task.spec.horizon)
 
     def render(self) -> Pixels | None:
-        """The scene as (size, size, 3); None without a render mode, or where there is none."""
+        """A picture (size, size, 3); None without a render mode, or if the task has no pictures."""
         return None if self.render_mode is None else self._env.picture(self._size)
 
     def close(self) -> None:
@@ -139,10 +146,10 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         raise TypeError("an environment holds an engine and cannot be copied: make another one")
 
     def _goals(self, achieved: Array, desired: Array) -> tuple[Floats, Floats]:
-        """Goals (n, ...) of vectors, or of n rows of them.
+        """Reshape vectors, or n rows of vectors, to goals (n, *shape of the field).
 
         Raises:
-            ValueError: they have other shapes, or are not as many.
+            ValueError: a shape is wrong, or the numbers of rows differ.
         """
         spec, rows = self.task.spec, np.shape(achieved)[:-1]
         goals = [np.asarray(one, np.float64) for one in (achieved, desired)]
@@ -155,7 +162,7 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         return first, second
 
     def _observation(self, seen: Arrays) -> Observation:
-        """Vectors of their own."""
+        """Copies of the first row of each field, flat."""
         spec = self.task.spec
         flat = {name: np.array(rows[0], np.float64).ravel() for name, rows in seen.items()}
         return {
@@ -173,14 +180,14 @@ def place(
     render_size: int = 240,
     **sim: Any,
 ) -> TaskEnv:
-    """Tokens that are moved onto their target.
+    """Make an environment of task=place: tokens are moved onto their target.
 
     Args:
-        shapes: of the tokens, see `TokensConfig`.
-        scale: of them; the default makes the square's side 0.4.
+        shapes: shapes of the tokens, see `TokensConfig`.
+        scale: scale of the tokens; the default makes the square's side 0.4.
         reward: the name of a reward.
         render_mode: see `TaskEnv`.
-        render_size: see there.
+        render_size: see `TaskEnv`.
         **sim: the fields of `SimConfig`, such as backend="kinematic".
     """
     world = from_mapping(SimConfig, sim, "sim")
@@ -195,7 +202,7 @@ def push(
     render_size: int = 240,
     **task: Any,
 ) -> TaskEnv:
-    """A finger that pushes tokens; as `place`, with the fields of `PushConfig`."""
+    """Make an environment of task=push; see `place`, but `task` has fields of `PushConfig`."""
     config = from_mapping(PushConfig, task, "task")
     return TaskEnv(Push(_tokens(shapes, scale), config), render_mode, render_size)
 

@@ -1,4 +1,4 @@
-"""What played episodes are worth: overlaps, errors of position and angle, how tokens make figures.
+"""Scores of played episodes: overlap, errors of position and angle, and faults in figures.
 
 Legend: E episodes, T steps, K tokens, V corners.
 """
@@ -15,22 +15,22 @@ from tangram_sim.rewards import make_reward
 from tangram_tasks.pairing import alike, paired
 from tangram_tasks.played import Played
 
-SOLVED = 0.95  # of the target covered
-# Share of a piece that a token must cover to count: less is a neighbour that reaches over.
+SOLVED = 0.95  # share of the target that must be covered
+# Share of a piece that a token must cover to count; neighbours reach over it by less.
 TOUCHED = 0.05
 USED = 0.25
 _ROUNDING = 1e-9
 
 
 def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Floats]:
-    """How far each token is from its place in the target, both as corners (E, V, 2).
+    """Errors of position and angle of tokens; `ends` and `goals` are corners (E, V, 2).
 
-    Equal tokens may change places: they are measured against the pieces that they are paired with.
+    Equal tokens may change places: each is compared with the piece that it is paired with.
 
     Returns:
-        (E, K) distances of the centres of area, in arena units; (E, K) angles between the
-        orientations modulo the shape's symmetry, in degrees, from 0 to 180 / symmetry, which is
-        also the error of a token that lies on the wrong side.
+        (E, K) distances of the centres of area, in arena units; (E, K) angles in degrees between
+        the orientations, modulo the shape's symmetry, from 0 to 180 / symmetry. A token on the
+        wrong side has the largest angle.
     """
     pairing = paired(layout, ends, goals)
     position: Floats = np.linalg.norm(pairing.way[..., :2], axis=-1)
@@ -40,17 +40,17 @@ def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Fl
 
 
 def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) -> dict[str, float]:
-    """Scores of E episodes; percentiles look at the bad end of each distribution.
+    """Scores of E episodes; percentiles are taken at the worse end.
 
     Args:
-        own_reward: report the mean of the last action's reward, too: training is not on Eq. 14 of
-            exact polygons.
+        own_reward: also report the mean reward of the last action, if training uses another reward
+            than Eq. 14 of exact polygons.
 
     Returns:
-        mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on),
-        mean_reward_dense (Eq. 15), coverage (in [0, 1]) and its 10th percentile,
-        medians and 90th percentiles of the errors over all tokens, episodes; mean_reward_camera
-        and mean_train_reward where they exist; with several tokens the means of `Assembled`.
+        mean_reward (always Eq. 14 of exact polygons, in [-1, 1]), mean_reward_dense (Eq. 15),
+        coverage (in [0, 1]) and its 10th percentile. Medians and 90th percentiles of the errors
+        over all tokens and episodes. mean_reward_camera and mean_train_reward where they exist.
+        With several tokens also the means of `Assembled`.
     """
     position, angle = pose_errors(layout, played.ends, played.goals)
     dense = make_reward(RewardConfig("dense"), layout, sim)
@@ -77,16 +77,16 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """Scores of E episodes.
+    """Scores of E assembled figures.
 
     Attributes:
         coverage: (E,) share of the target that the tokens cover, in [0, 1].
-        iou: (E,) area that tokens and target share over the area of both together, in [0, 1].
+        iou: (E,) intersection over union of tokens and target, in [0, 1].
         wrong: (E,) pieces of the target that a token of another shape covers most, and by more
-            than `TOUCHED`; on its other side a chiral token has another shape.
+            than `TOUCHED`; a chiral token on its other side counts as another shape.
         doubly_used: (E,) pieces that two or more tokens cover by more than `USED` each.
-        refused: (E,) actions that named a placed token.
-        blocked: (E,) tokens that could not be set down because of others.
+        refused: (E,) actions that chose a placed token.
+        blocked: (E,) tokens that could not be set down because others were in the way.
         actions_used: (E,) actions that were not refused.
     """
 
@@ -111,7 +111,7 @@ class Assembled:
 
 
 def assembled(layout: Layout, played: Played) -> Assembled:
-    """Scores of episodes as they ended."""
+    """Scores of the figures at the end of played episodes."""
     coverage = covered_share(played.ends, played.goals, layout)
     covered = covered_shares(layout, played.ends, played.goals)
     refused = played.refused.sum(axis=1)
@@ -140,7 +140,7 @@ def covered_shares(layout: Layout, ends: Floats, goals: Floats) -> Floats:
 
 
 def iou(layout: Layout, ends: Floats, coverage: Floats) -> Floats:
-    """(E,) intersection over union of tokens at corners (E, V, 2) and targets covered so much."""
+    """(E,) intersection over union, of tokens at `ends` (E, V, 2) and their `coverage` (E,)."""
     whole = layout.areas.sum()
     common = coverage * whole
     share: Floats = common / (whole + union_area(ends, layout) - common)
@@ -148,10 +148,10 @@ def iou(layout: Layout, ends: Floats, coverage: Floats) -> Floats:
 
 
 def _wrong(layout: Layout, played: Played, covered: Floats) -> Ints:
-    """(E,), see `Assembled`."""
+    """(E,) wrong pieces, see `Assembled`."""
     sides = layout.flipped(played.goals)[:, :, None] == layout.flipped(played.ends)[:, None]
     same = alike(layout) & sides
-    # A piece that two cover alike is right if one of them is.
+    # A piece that a right and a wrong token cover equally counts as right.
     right = np.where(same, covered, 0.0).max(axis=2)
     other = np.where(same, 0.0, covered).max(axis=2)
     wrong: Ints = ((other > right + _ROUNDING) & (other > TOUCHED)).sum(axis=1)

@@ -1,4 +1,4 @@
-"""Which token goes onto which piece of the target: equal ones may change places.
+"""Assignment of tokens to pieces of the target: equal tokens may change places.
 
 Legend: E episodes, K tokens, V corners.
 """
@@ -15,12 +15,12 @@ from tangram_sim.geometry.shapes import turn_onto
 
 @dataclass(frozen=True, eq=False)
 class Pairing:
-    """The target piece of each token, and the way to it.
+    """The target piece of each token, and the way from token to piece.
 
     Attributes:
         target: (E, K) number of the piece.
-        way: (E, K, 3) x, y (arena units) and the smallest turn (radians) from the token to it.
-        other_side: (E, K) the piece lies on the other side than the token.
+        way: (E, K, 3) x, y (arena units) and smallest turn (radians) from token to piece.
+        other_side: (E, K) whether the token must be turned over to match the piece.
     """
 
     target: Ints
@@ -29,15 +29,15 @@ class Pairing:
 
 
 def paired(layout: Layout, corners: Floats, goals: Floats) -> Pairing:
-    """Pair the tokens with pieces of their shape so that they have the least way in all.
+    """Pair each token with a piece of its shape so that the sum of all ways is least.
 
-    A way is the distance of the centres and the arc of the farthest corner; a token whose side is
-    not the piece's takes it only where no other can.
+    The length of a way is the distance of the centres plus the arc of the farthest corner. A token
+    gets a piece that lies on its other side only if no other pairing is left.
 
     Args:
         layout: the tokens.
-        corners: (E, V, 2) of the tokens.
-        goals: (E, V, 2) of the target.
+        corners: (E, V, 2) corners of the tokens.
+        goals: (E, V, 2) corners of the target.
     """
     turns = _turns(layout)
     ways = all_ways(layout, corners, goals)
@@ -54,22 +54,22 @@ def paired(layout: Layout, corners: Floats, goals: Floats) -> Pairing:
 
 
 def _assigned(cost: Floats) -> Ints:
-    """Columns (n,) of rows 0 to n - 1 of a cost (n, n): those of the least sum."""
-    # Only here: its import takes half a second of CPU time, and one token needs none of it.
+    """The column of each row of a cost matrix (n, n), so that the sum is least."""
+    # Imported here: scipy takes half a second of CPU time, and a single token does not need it.
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415
 
     return np.asarray(linear_sum_assignment(cost)[1])
 
 
 def alike(layout: Layout) -> Bools:
-    """(K, K) which tokens have one shape and size, and are on one side the same when turned."""
+    """(K, K) whether a turn, without a flip, makes one token's shape equal another's."""
     same: Bools = np.isfinite(_turns(layout))
     return same
 
 
 @lru_cache(maxsize=16)
 def _turns(layout: Layout) -> Floats:
-    """(K, K) the turn of a token's body that gives another's, NaN where none does."""
+    """(K, K) turn in radians that maps one token's body onto another's; NaN if none does."""
     turns = np.full((layout.tokens, layout.tokens), np.nan)
     for k, own in enumerate(layout.shapes):
         for j, other in enumerate(layout.shapes):
@@ -79,16 +79,16 @@ def _turns(layout: Layout) -> Floats:
 
 
 def _groups(turns: Floats) -> list[Ints]:
-    """The tokens of each shape that several have."""
+    """Numbers of the tokens of each shape that several tokens have."""
     groups = [np.flatnonzero(row) for k, row in enumerate(np.isfinite(turns)) if row.argmax() == k]
     return [group for group in groups if len(group) > 1]
 
 
 def all_ways(layout: Layout, corners: Floats, goals: Floats) -> Floats:
-    """(E, K, K, 3) from every token to every piece, the turn modulo the symmetry."""
+    """(E, K, K, 3) x, y and turn (modulo the symmetry) from every token to every piece."""
     turns = _turns(layout)
     ways: Floats = layout.poses(goals)[:, None] - layout.poses(corners)[:, :, None]
-    # A body on its other side is turned the other way.
+    # A flipped body turns in the opposite direction.
     turn = np.where(layout.flipped(goals)[:, None], -1.0, 1.0) * np.nan_to_num(turns)
     period = 2.0 * np.pi / layout.symmetries
     ways[..., 2] += turn

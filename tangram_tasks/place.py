@@ -1,4 +1,4 @@
-"""Tokens are moved onto their target: one to seven of them, by PyBullet or exactly.
+"""Task `place`: one to seven tokens are moved onto their target, by PyBullet or exactly.
 
 Legend: K tokens, V corners.
 """
@@ -57,11 +57,11 @@ SEVERAL = (
 
 @dataclass(frozen=True)
 class Place(Task):
-    """The paper's task, and all of the tangram: every piece of the target is seen."""
+    """The paper's task, also for several tokens; agents see every piece of the target."""
 
     sections: ClassVar = {"tokens": TokensConfig, "sim": SimConfig, "reward": RewardConfig}
     agent: ClassVar = "tangram"
-    waits: ClassVar = "in one, pictures must show all tokens: larger sim.pixels help"
+    waits: ClassVar = "its pictures must show all tokens: a larger sim.pixels helps"
     outlines: ClassVar[bool] = False  # whether goals are rows of the target's outline
 
     tokens: TokensConfig
@@ -78,64 +78,64 @@ class Place(Task):
 
     @cached_property
     def layout(self) -> Layout:
-        """The token set's fixed structure."""
+        """The fixed geometry of the token set."""
         return make_layout(self.tokens)
 
     @cached_property
     def reward_of(self) -> RewardFn:
-        """(achieved corners (n, V, 2), desired ones) -> rewards (n,)."""
+        """The reward function: achieved and desired corners (n, V, 2) -> rewards (n,)."""
         return make_reward(self.reward, self.layout, self.sim)
 
     def rewards(self, achieved: Array, desired: Array) -> Floats:
-        """(n,) of corners (n, V, 2)."""
+        """Rewards (n,) of achieved and desired corners (n, V, 2)."""
         return self.reward_of(achieved.astype(np.float64), desired.astype(np.float64))
 
     @property
     def horizon(self) -> int:
-        """T: actions in one episode."""
+        """Number of actions in an episode (T)."""
         return horizon(self.layout.tokens, self.sim)
 
     @property
     def goal_rows(self) -> int:
-        """G: corners of a target as agents see it."""
+        """Number of a target's corners that agents see (G)."""
         return goal_rows(self.layout, self.sim)
 
     @property
     def action_size(self) -> int:
-        """A: x, y and angular velocity, with more than one token its number before them."""
+        """Size of an action (A): token (if several), flip (if allowed) and 3 velocities."""
         return action_size(self.layout.tokens, self.sim)
 
     @property
     def bound(self) -> float:
-        """The largest |coordinate| that a corner can reach."""
+        """Largest |coordinate| that a corner can reach."""
         return corner_bound(self.layout.tokens, self.sim)
 
     @cached_property
     def spec(self) -> EpisodeSpec:
-        """What its episodes are made of."""
+        """Names, shapes and dtypes of the arrays in an episode."""
         return spec_of(self.layout, self.sim, self.reward, self.outlines)
 
     def make(self, count: int, purpose: Purpose = "play") -> "PlaceEnv":
-        """So many worlds; see `PlaceEnv`."""
+        """Make `count` worlds; see `PlaceEnv`."""
         from tangram_tasks.env import PlaceEnv  # noqa: PLC0415
 
         return PlaceEnv(self, count, purpose)
 
     @property
     def scores(self) -> tuple[Score, ...]:  # type: ignore[override]
-        """Of one token its pose, of several how much of the target they cover."""
+        """Scores of the pose of one token, or of the coverage by several tokens."""
         return ONE_TOKEN if self.layout.tokens == 1 else SEVERAL
 
     def score(self, played: Played) -> dict[str, float]:
-        """See `metrics.summarise`."""
-        from tangram_tasks.metrics import summarise  # noqa: PLC0415  # scipy, for who scores alone
+        """Compute the scores of played episodes; see `metrics.summarise`."""
+        from tangram_tasks.metrics import summarise  # noqa: PLC0415  # scipy, which only scoring needs
         from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
 
         own = (self.reward.name, self.reward.source) != ("overlap", "polygon")
         return summarise(self.layout, self.sim, PlayedTokens.of(played), own)
 
     def draw(self, played: Played) -> Pixels:
-        """The first episodes, each with its overlap."""
+        """Draw how the first episodes ended, each with its overlap."""
         from tangram_sim.drawing.scenes import episode_sheet  # noqa: PLC0415
         from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
 
@@ -145,13 +145,13 @@ class Place(Task):
         return np.asarray(sheet.convert("RGB"))
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """See `tangram_tasks.rivals.every`."""
+        """The baselines by name; see `tangram_tasks.rivals.every`."""
         from tangram_tasks.rivals.every import rivals_of  # noqa: PLC0415
 
         return rivals_of(self.layout, self.sim)
 
     def identity(self) -> Json:
-        """Tokens by what makes them, a reward of one's own by its content."""
+        """Token geometry, sim and reward, which must be equal on master and workers."""
         return {
             "tokens": {"layout": self.layout.fingerprint()},
             "sim": asdict(self.sim),
@@ -159,21 +159,26 @@ class Place(Task):
         }
 
     def check(self, *, plays: bool) -> None:
-        """Refuse what no world could play, or no agent is shown."""
+        """Refuse settings that no world can play or no agent can observe.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+            SamplingError: the tokens do not fit into the arena.
+        """
         check_shown(self.sim, self.outlines)
         (check_world if plays else check_room)(self.layout, self.sim)
         check_reward(self.reward, self.layout, self.sim)
 
     def pinned(self) -> Self:
-        """With a reward of one's own named by its content, so that it holds elsewhere, too."""
+        """A copy that names a user's own reward by absolute path and hash of its file."""
         return replace(self, reward=pinned(self.reward))
 
     def with_sim(self, **values: Any) -> Self:
-        """In another world."""
+        """A copy with other values of `sim`."""
         return replace(self, sim=replace(self.sim, **values))
 
     def facts(self) -> Json:
-        """Tokens, actions, reward and engine."""
+        """Tokens, actions per token, reward and engine, for result.json."""
         return {
             "tokens": [shape.name for shape in self.layout.shapes],
             "actions_per_token": self.sim.actions_per_token,

@@ -1,4 +1,4 @@
-"""Episodes of tokens as scores, rivals and pictures see them.
+"""Played episodes of tokens, for scores, rivals and pictures.
 
 Legend: E episodes, B environments, T steps of an episode, K tokens, V corners, A entries of an
 action.
@@ -18,32 +18,31 @@ Fields = TypeVar("Fields")  # arrays or tensors
 
 
 def closed(seen: Mapping[str, Fields]) -> Fields:
-    """(B, K) tokens that no action should name: placed, or not seen while others are."""
+    """(B, K) tokens that no action should choose: placed, or unseen while others are seen."""
     return seen.get("closed", seen["placed"])
 
 
 def as_seen(seen: Arrays) -> tuple[Floats, Bools, Floats]:
-    """What rivals go by: corners (B, V, 2), `closed` tokens (B, K) and goals (B, V, 2)."""
+    """Corners (B, V, 2), `closed` tokens (B, K) and goals (B, V, 2), as rivals need them."""
     corners, goals = (np.asarray(seen[name], np.float64) for name in ("corners", "goals"))
     return corners, np.asarray(closed(seen), np.bool_), goals
 
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """E whole episodes: what travels of them, and what only the environments know.
+    """E whole episodes, with exact facts that only the environments know.
 
     Attributes:
         episodes: corners and goals as the policy saw them, its actions and their rewards.
-        corners: (E, T + 1, V, 2) as they are, before each step and after the last.
-        goals: (E, V, 2) corners of the targets as they are.
+        corners: (E, T + 1, V, 2) exact corners, before each step and after the last.
+        goals: (E, V, 2) exact corners of the targets.
         overlap: (E,) raw overlap of exact polygons after the last step.
-        refused: (E, T) where the action named a placed token.
-        blocked: (E, T) where a token could not be set down on others.
-        seconds: (E,) wall time of choosing and moving, an equal share for each of those that were
-            played together.
+        refused: (E, T) whether the action chose a placed token.
+        blocked: (E, T) whether a token could not be set down because it would lie on others.
+        seconds: (E,) wall time of choosing and moving; episodes played together share it equally.
         chose: (E,) processor time of choosing.
         camera: (E,) Eq. 14 of the pictures after the last step; None without a camera.
-        pictures: (E, T + 1, P, P) that were shown to the agent; None where it sees no pictures.
+        pictures: (E, T + 1, P, P) pictures that the agent saw; None if it sees none.
     """
 
     episodes: Episodes
@@ -69,7 +68,7 @@ class Played:
 
     @staticmethod
     def of(played: task.Played) -> "Played":
-        """What the facts of a `PlaceEnv` say."""
+        """Read episodes and the facts of a `PlaceEnv`."""
         facts = played.facts
         return Played(
             episodes=played.episodes,

@@ -1,6 +1,6 @@
-"""The ids of gymnasium: after `import tangram_tasks.register`, `gymnasium.make("Push-v0")` works.
+"""Gymnasium ids: after `import tangram_tasks.register`, `gymnasium.make("Push-v0")` works.
 
-Neither the environment nor the engine is loaded before one is made.
+Environment and engine are imported when the first environment is made.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ SEVEN = (
     *("large_triangle", "large_triangle", "medium_triangle", "small_triangle", "small_triangle"),
     *("square", "parallelogram"),
 )
-# Id -> task, and where it differs from what `goal_env` has.
+# Id -> function of `goal_env`, and the arguments that differ from its defaults.
 IDS: dict[str, tuple[str, dict[str, Any]]] = {
     "Tangram-v0": ("place", {}),  # the paper's task, which pretrained/square plays
     "Tangram7-v0": (
@@ -25,7 +25,7 @@ IDS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 for _name, (_task, _settings) in IDS.items():
-    if _name not in gymnasium.registry:  # else the module was loaded again
+    if _name not in gymnasium.registry:  # a reloaded module registers nothing twice
         gymnasium.register(
             id=_name, entry_point=f"tangram_tasks.goal_env:{_task}", kwargs=_settings
         )

@@ -1,7 +1,8 @@
-"""Pictures -> tokens; silhouettes -> tokens that fill them. Workers only, by OpenCV.
+"""Find tokens in pictures, and fill silhouettes with tokens. Only workers use it; needs OpenCV.
 
-Start with `solving.py`, `pictures/seeing.py` and `silhouettes/silhouettes.py`. Folders, each
-imports those behind it only: given, silhouettes, pictures. May import tangram_sim and tangram_core.
+Start with `solving.py`, `pictures/seeing.py` and `silhouettes/silhouettes.py`. Folders: given,
+silhouettes, pictures; each imports only those named after it. May import tangram_sim and
+tangram_core.
 """
 
 from typing import TYPE_CHECKING
@@ -11,18 +12,18 @@ if TYPE_CHECKING:
 
 
 def solve(path: str) -> "Solution":
-    """Where the seven tans lie in a figure: they fill it, or come as near as was found.
+    """Place the seven tans so that they fill a figure, or come as near to it as a search finds.
 
-    It takes up to five seconds of processor time, and half as long again where nothing fills it.
+    A call takes up to 5 s of processor time, and up to 7.5 s if nothing fills the figure.
 
     Args:
-        path: of a picture, an SVG, a puzzle or an outline as JSON; or a puzzle of the library, as
-            "cat".
+        path: a picture, an SVG, or a JSON file of a puzzle or an outline; or the name of a puzzle
+            of the library, such as "cat".
 
     Raises:
-        tangram_core.errors.ConfigError: it cannot be read; says why, and what to do.
+        tangram_core.errors.ConfigError: the file cannot be read; says why, and what to do.
     """
-    # Only here: whoever wants another part of the package needs no OpenCV for it.
+    # Imported here, so that other parts of the package work without OpenCV.
     from tangram_sim.geometry.layout import TokensConfig, make_layout  # noqa: PLC0415
     from tangram_sim.puzzles.assembly import COUNTS  # noqa: PLC0415
     from tangram_vision.solving import answer  # noqa: PLC0415

@@ -1,6 +1,6 @@
-"""The answer as data: where each token lies, to be written down and read by other programs.
+"""The answer as data: where each token lies, for files that other programs read.
 
-`solution.schema.json` beside this file is for programs that check files.
+`solution.schema.json` beside this file is the JSON schema of these files.
 """
 
 from math import ceil
@@ -16,21 +16,21 @@ from tangram_sim.geometry.layout import Layout
 
 Point = tuple[float, float]
 Kind = Literal["filled", "nearest", "seen"]
-_ROUND = 6  # digits after the point
+_ROUND = 6  # decimal places
 
 
 class Token(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One token where it lies.
+    """A token and its pose.
 
     Attributes:
-        order: when it is laid, from 1: the larger ones first.
-        shape: its name, as in `tokens.shapes`.
-        x, y: its centre of area, in sides of the full square that tans are cut from, y up, from the
-            middle of the figure.
-        angle: radians by which the shape is turned, against the clock, after it was turned over.
-        flipped: whether it is turned over, about its x axis.
-        corners: as x and y.
-        pixels: the same corners in `Solution.picture`, y down, (0, 0) its upper left corner.
+        order: number in the order of laying, from 1; larger tokens come first.
+        shape: name of the shape, as in `tokens.shapes`.
+        x, y: centre of area, from the middle of the figure, y up. The unit is the side of the full
+            square that the tans are cut from.
+        angle: counterclockwise turn in radians, after the shape was turned over.
+        flipped: whether the shape is turned over, about its x axis.
+        corners: x and y of each corner, in the unit above.
+        pixels: the same corners in `Solution.picture`, y down; (0, 0) is its upper left corner.
     """
 
     order: int
@@ -44,29 +44,29 @@ class Token(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Picture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What `pixels` count in: the picture as given; of an SVG its page; else one of our own."""
+    """Size of the picture that `pixels` refer to: as given, an SVG's page, or drawn from a file."""
 
     width: int
     height: int
 
     @staticmethod
     def of(page: tuple[float, float]) -> "Picture":
-        """Of a page's width and height, rounded up."""
+        """The size of a page (width, height), rounded up."""
         return Picture(ceil(page[0]), ceil(page[1]))
 
 
 class Solution(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How tokens make a figure.
+    """Where the tokens of a figure lie.
 
     Attributes:
-        source: the figure, as it was named.
-        kind: filled: they fill it; nearest: nothing fills it, and they come as near as was found;
+        source: the figure, as the user named it.
+        kind: filled: the tokens fill the figure; nearest: they come as near as a search found;
             seen: they were found in a photograph.
-        told: the same in words.
-        iou: area that tokens and figure share over the area of both together.
-        seconds: of processor time that it took. Of tokens that were seen both are None.
-        picture: its size.
-        tokens: in the order of laying.
+        told: the result in words.
+        iou: intersection over union of tokens and figure; None for the kind seen.
+        seconds: processor time that was used; None for the kind seen.
+        picture: size of the picture.
+        tokens: all tokens, in the order of laying.
     """
 
     format: Literal["tangram-solution"] = "tangram-solution"
@@ -80,11 +80,11 @@ class Solution(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     tokens: list[Token]
 
     def json(self) -> bytes:
-        """As a file."""
+        """The solution as the content of a JSON file."""
         return msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
 
     def svg(self) -> bytes:
-        """As a drawing of the size of the picture, a polygon for each token."""
+        """The solution as an SVG file of the picture's size, with a polygon for each token."""
         width, height = self.picture.width, self.picture.height
         head = f'width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
         lines = [f'<svg xmlns="http://www.w3.org/2000/svg" {head}>']
@@ -98,13 +98,13 @@ class Solution(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def tokens_of(layout: Layout, scale: float, lies: Dissection, pixels: Floats) -> list[Token]:
-    """Tokens as they lie, the larger ones first.
+    """Tokens with their poses, the larger ones first.
 
     Args:
         layout: the tokens.
-        scale: side of the full square in its units.
-        lies: how they lie, with y up.
-        pixels: (V, 2) corners in the picture.
+        scale: side of the full square, in units of the layout.
+        lies: poses of the tokens, y up.
+        pixels: (V, 2) corners of all tokens in the picture.
     """
     corners = layout.corners(lies.poses, lies.flipped)
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0

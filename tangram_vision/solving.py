@@ -1,4 +1,4 @@
-"""A figure, of a file or of the library -> tokens that fill it; else those that come nearest."""
+"""Fill a figure of a file or of the library with tokens, or find their nearest figure."""
 
 import time
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from tangram_vision.silhouettes.approximations import nearest_figure
 from tangram_vision.silhouettes.tilts import mapped
 from tangram_vision.solution import Picture, Solution, tokens_of
 
-SECONDS = 5.0  # of a search, and
-NEAREST_SECONDS = 2.5  # of what comes nearest
+SECONDS = 5.0  # for the search of an exact filling
+NEAREST_SECONDS = 2.5  # for the search of the nearest figure
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """How tokens make a figure.
+    """The tokens' arrangement for a figure.
 
     Attributes:
-        drawn: what was shown.
-        lies: how they fill it, or come nearest.
-        exact: whether they fill it.
-        iou: area that figure and tokens share over the area of both together.
-        told: how it was filled, or why not, in words.
-        seconds: of processor time that it took.
+        drawn: the figure as it was read.
+        lies: poses of the tokens, which fill the figure or come nearest to it.
+        exact: whether the tokens fill the figure.
+        iou: intersection over union of figure and tokens.
+        told: how the figure was filled, or why not, in words.
+        seconds: processor time that was used.
     """
 
     drawn: Silhouette
@@ -36,7 +36,7 @@ class Answer:
     seconds: float
 
     def solution(self, layout: Layout, scale: float, source: str) -> Solution:
-        """The same as data; the side of the full square is in units of the layout."""
+        """The answer as data; `scale` is the full square's side, in units of the layout."""
         own = mapped(self.drawn.own, self.drawn.corners(layout, self.lies))
         return Solution(
             source=source,
@@ -52,10 +52,10 @@ class Answer:
 def answer(
     name: str, source: str, layout: Layout, scale: float, seconds: float = SECONDS
 ) -> Answer:
-    """Fill a figure, or come near to it with all tokens; see `fill_silhouette`.
+    """Fill a figure, or find the nearest figure of all tokens; arguments as in `fill_silhouette`.
 
     Raises:
-        ConfigError: a file that cannot be used.
+        ConfigError: the file cannot be used.
     """
     begin = time.thread_time()
     drawn = fill_silhouette(name, source, layout, scale, seconds)
@@ -76,7 +76,7 @@ def _unfilled(drawn: Silhouette, layout: Layout) -> str:
     tokens = "the seven tans" if has_all_tans(layout) else names
     if drawn.share is not None:
         share = f"{drawn.share:.2f}" if 0.01 <= drawn.share < 100.0 else f"{drawn.share:.2g}"
-        return f"is {share} times as large as {tokens} by its side, and not filled in their size"
+        return f"is {share} times as large as {tokens} by its side, and not filled at their size"
     if filled.complete:
         return f"cannot be filled with {tokens}: all ways were tried, {filled.nodes} steps"
     return f"was not filled with {tokens} in {filled.seconds:.1f} s"

@@ -357,7 +357,7 @@ def test_presets_of_ones_own_are_taken(entered: Entered, presets: Path, form: st
             "/tokens/mine.yaml sets nothing: write settings as in name: value",
         ),
         ("tokens/mine.yaml", "[a]", "/tokens/mine.yaml sets nothing"),
-        ("tokens/square.yaml", "scale: 1\n", "is called as a preset that comes with tangram-rl"),
+        ("tokens/square.yaml", "scale: 1\n", "has the name of a preset that comes with tangram-rl"),
     ],
 )
 def test_wrong_presets_of_ones_own_are_refused(
@@ -495,16 +495,16 @@ def test_entry_does_not_hide_a_fault_of_ours(entered: Entered) -> None:
         ("train tokens=mine", "unknown tokens 'mine': choose from hexagon"),
         ("train tokens=[square,square]", "write tokens.shapes=[square,square]"),
         ("train =3", "cannot read '=3': write name=value"),
-        ("train ~agent.noise", "'~agent.noise': no setting is taken away, write agent.noise=value"),
-        ("train tokens=3", "a config group takes the name of a preset, and no number"),
+        ("train ~agent.noise", "'~agent.noise': a setting cannot be removed, write agent.noise"),
+        ("train tokens=3", "a config group takes the name of a preset, not a number"),
         (f"train seed={'[' * 3000}{']' * 3000}", "nested too deeply: write fewer brackets"),
-        ("eval run_dir=x sim=kinematic", "sim=kinematic chooses a preset, and a trained run has"),
+        ("eval run_dir=x sim=kinematic", "sim=kinematic chooses a preset, but a trained run has"),
         ("eval run_dir=x tokens=square", "unknown setting 'tokens' (a trained run keeps its own)"),
         ("eval run_dir=x task.kind=place", "unknown setting 'task.kind' ("),
         ("train seed=\x1b[1m", "cannot read 'seed=\\x1b[1m': write name=value"),
         ("train sim=[physics,kinematic]", "sim takes one preset, got [physics,kinematic]"),
-        ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
-        ("eval run_dir=x -seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
+        ("eval run_dir=x --seed=3", "settings have no dashes, as in seed=3; --help lists them"),
+        ("eval run_dir=x -seed=3", "settings have no dashes, as in seed=3; --help lists them"),
     ],
 )
 def test_what_would_be_taken_for_something_else_is_refused(

@@ -1,6 +1,6 @@
-"""Plays for a master, or scores what it has learned; what a training needs and no more.
+"""Worker processes: players, evaluators, and the command tangram-status.
 
-Start with `play/player.py` and `score/evaluator.py`. Folders, each imports those behind it only:
-score, play, talk. May import tangram_agent, tangram_vision, tangram_sim and tangram_core; neither
-master nor tangram_game.
+Start with `play/player.py` and `score/evaluator.py`. Folders: score, play, talk; each may import
+only folders to its right in this list. May import tangram_agent, tangram_vision, tangram_sim and
+tangram_core, but not master or tangram_game.
 """

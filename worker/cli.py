@@ -1,6 +1,6 @@
 """The commands tangram-worker and tangram-status.
 
-Everything heavy is imported after the config was composed, so --help and wrong input are instant.
+Heavy modules are imported after the settings are read, so --help and wrong input answer at once.
 """
 
 import sys
@@ -11,21 +11,21 @@ from conf.commands import Plain
 
 
 def worker() -> int:
-    """tangram-worker: plays for a master, or scores what it has learned."""
+    """Run tangram-worker, a player or an evaluator, and return its exit status."""
     return entry("worker", _worker, _of_the_run)
 
 
 def status() -> int:
-    """tangram-status: how a run stands."""
+    """Run tangram-status, which prints the state of a run, and return its exit status."""
     return entry("status", _status)
 
 
 def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
-    """What the connection file says of the run; nothing where only an address is given."""
+    """The run's settings from its connection file; None if `connect` is an address."""
     from tangram_core.run.process import watch_parent
     from worker.talk.discovery import as_address, await_master
 
-    watch_parent()  # already here: a parent may end while the file is waited for
+    watch_parent()  # already here: the parent may end while this process waits for the file
     connect = settings.get("connect")
     if not isinstance(connect, str) or not connect.strip() or as_address(connect) is not None:
         return None
@@ -40,7 +40,7 @@ def _worker(settings: Plain) -> int:
     setup = make_setup(settings)
     rest = {name: value for name, value in settings.items() if name not in setup.sections}
     config = from_mapping(WorkerConfig, rest)
-    setup.task.check(plays=True)  # before anything is connected
+    setup.task.check(plays=True)  # before the connection is opened
 
     from worker.play.session import keep_part
 

@@ -1,4 +1,4 @@
-"""Settings of a worker process, and of who asks how a run stands."""
+"""Settings of tangram-worker and of tangram-status."""
 
 from dataclasses import dataclass, field
 
@@ -13,35 +13,37 @@ from worker.talk.discovery import as_address, find_master
 class _Connected(Settings):
     connect: str = field(
         metadata=declared(
-            "the run: its folder or its connection.json; host:port with service.auth=off only"
+            "the run: its folder or its connection.json; host:port only with service.auth=off"
         )
     )
 
     def __post_init__(self) -> None:
         if not self.connect.strip():
             raise ConfigError(
-                "connect must name the master's endpoint, got '': set connect=HOST:PORT"
+                "connect must name a run folder or its connection.json, got '': set connect=RUN_DIR"
             )
         if as_address(self.connect) is not None:
-            find_master(self.connect)  # no file is read: it only has to be one
+            find_master(self.connect)  # reads no file, only checks that the address is valid
         super().__post_init__()
 
 
 @dataclass(frozen=True)
 class WorkerConfig(_Connected):
-    """One process that plays for a master, or that scores what the master has learned."""
+    """Settings of one worker process, a player or an evaluator."""
 
     role: str = setting(
-        "player", "player, or evaluator: plays fixed tests, noise off, sends scores", choices=ROLES
+        "player",
+        "player: plays to learn from; evaluator: scores the agent on fixed tests",
+        choices=ROLES,
     )
     index: int = setting(
-        -1, "number of this worker, -1: the master gives one", low=-1, high=MAX_INDEX
+        -1, "number of this worker; -1: the master chooses one", low=-1, high=MAX_INDEX
     )
     service: ServiceConfig = field(default_factory=ServiceConfig)
 
 
 @dataclass(frozen=True)
 class StatusConfig(_Connected):
-    """How a run stands (tangram-status)."""
+    """Settings of tangram-status."""
 
-    json: bool = setting(False, "print one JSON object a line instead of a table")
+    json: bool = setting(False, "print the status as one line of JSON instead of a table")

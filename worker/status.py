@@ -1,4 +1,4 @@
-"""tangram-status: how a run stands, asked of its master from anywhere that its workers may be."""
+"""tangram-status: asks a master for the status of its run, from any machine a worker may use."""
 
 import json
 import math
@@ -41,11 +41,11 @@ REFUSED = {
 
 
 def show_status(config: StatusConfig) -> int:
-    """Print the status, or the result of a run that has finished; exit status 0.
+    """Print the status of a run, or its result if it has finished; return exit status 0.
 
     Raises:
-        TangramError: neither a connection file nor a result, keys that do not fit, or a master
-            that does not answer.
+        TangramError: there is neither a connection file nor a result, the keys are wrong, or the
+            master does not answer.
     """
     console, result = Console(), Path(config.connect) / FILE_NAME
     if result.is_file() and find_master(config.connect) is None:
@@ -71,7 +71,7 @@ def _print_result(console: Console, result: Mapping[str, Any], config: StatusCon
 def ask_status(
     connect: str, context: "zmq.Context[zmq.Socket[bytes]]", patience_s: float = PATIENCE_S
 ) -> RunStatus:
-    """The present status of a run, see `find_master` and `show_status`."""
+    """Ask the master for the status of a run; raises the errors of `find_master`, `show_status`."""
     address = find_master(connect)
     if address is None:
         raise TangramError(f"no connection file at {connect}: {_nobody(Path(connect) / CONFIG)}")
@@ -101,7 +101,7 @@ def ask_status(
 
 
 def _nobody(config: Path) -> str:
-    """Why no master can be asked; each writes its config when it starts."""
+    """Why there is no connection file: a master writes its config first, when it starts."""
     if not config.is_file():
         return "no master runs there"
     ago = duration(max(0.0, time.time() - config.stat().st_mtime))
@@ -112,7 +112,7 @@ def _read(frames: list[bytes]) -> RunStatus | None:
     try:
         message = decode_from_master(frames, None)
     except WireError as error:
-        raise TangramError(f"the master's answer is not understood: {error}") from None
+        raise TangramError(f"the answer of the master cannot be decoded: {error}") from None
     return message if isinstance(message, RunStatus) else None
 
 
@@ -130,16 +130,16 @@ def _print(console: Console, status: RunStatus, connect: str) -> None:
     _print_rows(console, [*_lines(numbers, texts), *_scores(status)])
     if len(status.workers):
         console.print(_table(status))
-    if status.numbers.get("evaluators") == 0:  # whole, so that it can be copied
+    if status.numbers.get("evaluators") == 0:  # on one line, so that it can be copied
         said = f"no evaluator yet (tangram-train starts its own): {_evaluator(connect)}"
         console.print(said, soft_wrap=True, markup=False, highlight=False)
 
 
 def _evaluator(connect: str) -> str:
-    """How to start one, with what this connection file is good for."""
+    """The command that starts an evaluator, or why this connection file cannot start one."""
     address = find_master(connect)
     if address is not None and address.keys and "evaluator" not in address.keys:
-        return f"{connect} has no key for one, tangram-keys makes it (add=NAME role=evaluator)"
+        return f"{connect} has no key for one; make it with tangram-keys (add=NAME role=evaluator)"
     own = {} if address is None else code_of(address.settings or {})
     given = [
         argument("connect", connect),
@@ -166,7 +166,7 @@ def _scores(status: RunStatus) -> Iterator[tuple[str, str]]:
 
 
 def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """What a person wants to know first."""
+    """The rows above the table of workers: name and text."""
     yield "does", texts.get("activity", "?")
     yield "episodes", f"{n['episodes']:,.0f}, {n['transitions_per_s']:,.1f} transitions/s"
     due = f"{n['lag_updates']:,.0f} due"
@@ -190,7 +190,7 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
 
 
 def _balance(play: float, learn: float, players: float) -> str:
-    """Which side waits for the other, and how many workers would do."""
+    """Whether workers or the learner wait, and how many workers would be enough."""
     waits = "workers wait" if play > learn else "the learner waits"
     text = f"{waits}: {play:,.0f} transitions/s can be played, {learn:,.0f} learned from"
     enough = max(1, math.ceil(players * learn / play))

@@ -1,6 +1,6 @@
-"""Talking to workers: sockets, who may connect and who takes part, which message goes where.
+"""Communication with workers: sockets, authentication, membership and message handling.
 
-Start with `hub.py`. `sockets.py` bounds what is queued, `gate.py` and `security.py` stand at the
-door, `admission.py` and `registry.py` say who takes part, `giving.py` makes keys for others. May
-import master.record; knows nothing of learning.
+Start with `hub.py`. `sockets.py` has bounded queues. `gate.py` limits connections, `security.py`
+checks keys. `admission.py` and `registry.py` decide which workers take part. `giving.py` is
+tangram-keys. May import master.record, but not master.learn.
 """

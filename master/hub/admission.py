@@ -1,7 +1,7 @@
-"""Admission: who may take part, with which key and settings, and the audit of who did.
+"""Admission: which processes may take part, with which key and settings; writes the audit log.
 
-Whoever has no key of the run gets no further than the sockets (`security`, `gate`). Indices and
-incarnations are the registry's.
+A process without a key of the run is stopped earlier, at the sockets (`security`, `gate`). The
+registry manages indices and incarnations.
 """
 
 from collections.abc import Mapping
@@ -19,11 +19,14 @@ from tangram_core.wire.messages import ROLES, TAKEN_OVER, Hello, Refused, Stop, 
 
 @dataclass(frozen=True)
 class WelcomeInfo:
-    """What the master tells, and asks of, a process that joins; see `Welcome` and `Hello`.
+    """Data that the master sends to a joining process or checks; see `Welcome` and `Hello`.
 
     Attributes:
-        spec: the task that arrays are checked against.
-        scores: names that an evaluator may report.
+        fingerprints: digest of each section of the settings; a joining process must have the same.
+        spec: shapes and dtypes that the arrays of a batch must have.
+        window: largest number of unacknowledged batches of one player.
+        lockstep: whether the run is in lockstep mode.
+        scores: names of the scores that an evaluator may report.
     """
 
     run_id: str
@@ -36,10 +39,10 @@ class WelcomeInfo:
 
 
 class Admission:
-    """Lets processes in and out, answers them, and writes it down.
+    """Admits and removes processes, answers them, and writes the audit log.
 
     Attributes:
-        registry: those who take part.
+        registry: the processes that take part.
     """
 
     def __init__(
@@ -56,14 +59,14 @@ class Admission:
         self._sockets, self._counters, self._audit = sockets, counters, audit
 
     def find(self, identity: bytes, caller: Holder) -> Peer | None:
-        """The peer of a connection, by its key: the name of a connection is no proof."""
+        """The peer of a connection, None if the key is not the peer's: identities can be forged."""
         peer = self.registry.find(identity)
         return peer if peer is not None and peer.holder == caller.name else None
 
     def hello(
         self, identity: bytes, hello: Hello, caller: Holder, address: str, epoch: str, now: float
     ) -> Peer | None:
-        """Welcome a process, or tell it why it may not take part; returns who may."""
+        """Answer a HELLO with a welcome or a refusal; returns the peer, None if refused."""
         try:
             self._check(hello, caller)
             peer, older = self.registry.admit(identity, hello, now, caller.name)
@@ -86,25 +89,25 @@ class Admission:
         return peer
 
     def leave(self, peer: Peer, reason: str) -> None:
-        """Of its own will."""
+        """Remove a peer that said goodbye."""
         self.registry.leave(peer)
         self._tell_of("left", peer, reason)
 
     def drop_silent(self, now: float) -> None:
-        """Forget those who were not heard of for so long."""
+        """Remove the peers that sent no message for `silence_s`."""
         for peer in self.registry.drop_silent(now, self._silence_s):
             reason = f"{peer.name} was silent for {self._silence_s:g} s"
             self._counters.note("lost_peers", reason)
             self._tell_of("lost", peer, reason)
 
     def drop_revoked(self) -> None:
-        """End those whose keys were revoked since."""
+        """Remove the peers whose keys were revoked since the last call."""
         for holder in self._sockets.revoked():
             for peer in [one for one in self.registry.peers if one.holder == holder.name]:
                 self.revoke(peer.identity, holder.name)
 
     def revoke(self, identity: bytes, key: str) -> None:
-        """End a connection whose key was revoked, whoever it is of."""
+        """Refuse a connection whose key was revoked, and remove its peer if there is one."""
         peer, reason = self.registry.find(identity), f"the key {key} was revoked"
         if peer is not None:
             self.registry.leave(peer)
@@ -112,19 +115,19 @@ class Admission:
         self._sockets.refuse(identity, "revoked", Stop(reason))
 
     def _check(self, hello: Hello, caller: Holder) -> None:
-        """RefusedError for another run, or for a key that does not let it take part like this."""
+        """Raise RefusedError if the run is another one, or the key does not allow this role."""
         if hello.run_id not in ("", self._info.run_id):
             reason = (
                 f"this master runs '{self._info.run_id}', not '{hello.run_id}': the connection "
-                "file is stale, take the one of a master that is running"
+                "file is stale, use the file of a running master"
             )
             raise RefusedError("refused_run", Refused(reason, later=True))
         if caller.role not in ("", hello.role):
-            reason = f"the key '{caller.name}' is one for role={caller.role}, not for role="
+            reason = f"the key '{caller.name}' is for role={caller.role}, not for role="
             raise RefusedError("refused_keys", Refused(reason + hello.role))
         for peer in self.registry.peers:
             its = peer.process == hello.process or peer.key == (hello.role, hello.index)
-            # What the run starts itself has its place: a key that was given away gets another.
+            # The run's own workers (keys in ROLES) may take their index back from any other key.
             if its and peer.holder != caller.name and caller.name not in ROLES:
                 raise RefusedError("refused_keys", Refused(f"{peer.name} {ANOTHER_KEY}"))
 
@@ -133,8 +136,8 @@ class Admission:
         self._counters["lost_batches"] += lost
         if lost:
             reason = (
-                f"{peer.name} says that {lost:,} of its batches were acknowledged which are not in "
-                "the replay: the disk has lost them, if it is right"
+                f"{peer.name} reports {lost:,} acknowledged batches that are not in the replay: if "
+                "this is right, the disk has lost them"
             )
             self._counters.note("losses", reason)
 
@@ -151,7 +154,7 @@ class Admission:
         )
 
     def _tell_of(self, event: str, peer: Peer, reason: str = "") -> None:
-        """One line of the audit."""
+        """Write one line of the audit log."""
         who = {"role": peer.role, "index": peer.index, "incarnation": peer.incarnation}
         where = {"process": peer.process, "key": peer.holder, "address": peer.address}
         self._audit.note(event, **who, **where, **({"reason": reason} if reason else {}))

@@ -1,7 +1,7 @@
-"""A fair queue: what waits is served by turns of those it is from, not in the order it came.
+"""A fair queue: the keys take turns, whatever the order in which their items came.
 
-Start-time fair queueing (Goyal, Vin and Cheng, 1996): whoever was served least is next. Who had
-nothing to be served meanwhile saves nothing up.
+Start-time fair queueing (Goyal, Vin and Cheng, 1996): the key with the least service so far is
+next. A key that had no items for a while does not save up service.
 """
 
 from collections import defaultdict, deque
@@ -11,10 +11,10 @@ Item = TypeVar("Item")
 
 
 class FairQueue(Generic[Item]):
-    """What waits, of each key in the order it came."""
+    """A queue with fair turns between keys; the items of one key stay in order."""
 
     def __init__(self) -> None:
-        self._of = dict[str, deque[Item]]()  # only keys that have something here
+        self._of = dict[str, deque[Item]]()  # only keys with items
         self._served = defaultdict[str, float](float)
         self._turn, self._now = "", 0.0
 
@@ -22,27 +22,27 @@ class FairQueue(Generic[Item]):
         return sum(map(len, self._of.values()))
 
     def put(self, key: str, item: Item) -> None:
-        """One more of a key."""
+        """Add an item of a key."""
         if key not in self._of:
             self._of[key] = deque()
             self._served[key] = max(self._served[key], self._now)
         self._of[key].append(item)
 
     def first(self) -> Item:
-        """The next one, which stays until it is served; IndexError where there is none."""
+        """The next item, which stays in the queue until `serve`; IndexError if there is none."""
         if not self._of:
             raise IndexError("nothing waits")
         self._turn = min(self._of, key=self._served.__getitem__)
         return self._of[self._turn][0]
 
     def serve(self, cost: float) -> Item:
-        """Take out what `first` has shown, and note what it cost."""
+        """Remove and return the item of the last `first`, and count its cost for its key."""
         waiting = self._of[self._turn]
         self._now = self._served[self._turn]
         self._served[self._turn] += cost
         item = waiting.popleft()
         if not waiting:
             del self._of[self._turn]
-        if not self._of:  # who has been served alone owes nobody
+        if not self._of:  # no other key had to wait, so the last key has no debt
             self._now = max(self._served.values())
         return item

@@ -1,8 +1,8 @@
-"""The door of the sockets: how many connections there may be, and how many without a key yet.
+"""Limits on connections: how many in all, and how many that are not authenticated yet.
 
-ZeroMQ bounds neither, and holds a frame for each that comes before anybody has shown a key. It
-tells of every connection that it accepts or loses. One that is too much is shut down from outside,
-which ZeroMQ takes for the end of the other side.
+ZeroMQ limits neither, and it buffers a frame of each connection before authentication. It reports
+each connection that it accepts or loses. An excess connection is shut down through a second
+descriptor of the same socket; to ZeroMQ this looks like a disconnect by the other side.
 """
 
 import os
@@ -20,20 +20,20 @@ import zmq
 from master.record.counters import Counters
 from tangram_core.errors import ConfigError
 
-# Connections that have shown no key, at a time. For one more the oldest is ended: a handshake takes
-# milliseconds, so it is idle. While others show keys, so long after each, the newest is: then it is
-# one of many workers. A worker that is hit comes again by itself.
+# Most connections that are not authenticated yet. One more ends the oldest: a handshake takes
+# milliseconds, so the oldest is idle. Within MOVING_S after any successful handshake it ends the
+# newest instead, since many workers may be joining. A worker that is hit connects again by itself.
 HANDSHAKES = 32
 MOVING_S = 0.1
 MAX_PEERS = 4096
-DESCRIPTORS = 2  # of each worker
+DESCRIPTORS = 2  # for each worker
 RESERVE = 192  # descriptors for files, HTTP and ZeroMQ itself
 MOST_FILES = RESERVE + HANDSHAKES + DESCRIPTORS * MAX_PEERS
-# Bytes that the master has sent over an encrypted connection when it has taken the key: greeting,
+# At least so many bytes were sent on an encrypted connection that is authenticated: greeting,
 # WELCOME and READY. Before that they are 234, or 246 with an error.
 LET_IN = 250
-SENT = struct.Struct("=QQ")  # tcpi_bytes_sent and tcpi_bytes_retrans of Linux' struct tcp_info,
-SENT_AT = 200  # which stand here
+SENT = struct.Struct("=QQ")  # tcpi_bytes_sent and tcpi_bytes_retrans of Linux' struct tcp_info
+SENT_AT = 200  # their offset there
 EVENT = struct.Struct("=HI")
 EVENTS = (
     zmq.EVENT_ACCEPTED
@@ -45,24 +45,24 @@ EVENTS = (
 
 @dataclass(frozen=True)
 class Room:
-    """How many may take part.
+    """Limits on connections and peers, from the limit on open files.
 
     Attributes:
-        files: that this process may have open.
+        files: how many files this process may have open.
     """
 
     files: int
 
     @staticmethod
     def here() -> "Room":
-        """As much as this process has or may take; ConfigError if there is none for a worker."""
+        """Raise this process's limit on open files as needed; ConfigError if no worker fits."""
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
         soft, hard = (MOST_FILES if n == resource.RLIM_INFINITY else n for n in limits)
         room = Room(max(soft, min(hard, MOST_FILES)))
         if room.peers < 1:
             raise ConfigError(
-                f"this process may open {room.files} files, which leaves none for a worker: allow "
-                f"at least {RESERVE + HANDSHAKES + DESCRIPTORS} (ulimit -n)"
+                f"this process may open {room.files} files, too few for one worker: allow at "
+                f"least {RESERVE + HANDSHAKES + DESCRIPTORS} (ulimit -n)"
             )
         if soft < room.files:
             resource.setrlimit(resource.RLIMIT_NOFILE, (room.files, limits[1]))
@@ -70,17 +70,17 @@ class Room:
 
     @property
     def connections(self) -> int:
-        """At a time."""
+        """Most connections at a time."""
         return min(self.files, MOST_FILES) - RESERVE
 
     @property
     def peers(self) -> int:
-        """Processes that take part."""
+        """Most processes that take part at a time."""
         return (self.connections - HANDSHAKES) // DESCRIPTORS
 
     @property
     def bound(self) -> str:
-        """What sets the most, in words, and how to get more."""
+        """End of a message about a full master: what sets the limit, and how to raise it."""
         if self.files >= MOST_FILES:
             return "there can be"
         return f"that {self.files} open files allow: raise ulimit -n and start the master again"
@@ -90,9 +90,9 @@ AMPLE = Room(MOST_FILES)
 
 
 class Gate:
-    """Watches the connections of bound sockets, in a thread of its own.
+    """Watches the connections of bound sockets in a thread, and ends the excess ones.
 
-    Where they are encrypted, who has shown no key is a stranger; else there are none.
+    The limit on connections without authentication holds only if the sockets are encrypted.
     """
 
     def __init__(
@@ -112,14 +112,14 @@ class Gate:
         self._thread.start()
 
     def end_all(self, endpoint: str) -> None:
-        """End all connections of a socket; those who may come connect again."""
+        """End all connections of a socket; workers with a valid key then connect again."""
         for descriptor in list(self._open):
             with suppress(OSError), _connection(descriptor) as found:
                 if _door(_named(found.getsockname())) == _door(endpoint):
                     found.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """End the thread, before the sockets are closed."""
+        """End the thread; call this before the sockets are closed."""
         for one in self._sockets:
             one.disable_monitor()
         self._thread.join()
@@ -127,7 +127,7 @@ class Gate:
             monitor.close(0)
 
     def _watch(self) -> None:
-        """Until both monitors have stopped: ZeroMQ waits for whoever does not read them."""
+        """Handle events until all monitors have stopped: ZeroMQ blocks if they are not read."""
         poller, left = zmq.Poller(), len(self._monitors)
         for monitor in self._monitors:
             poller.register(monitor, zmq.POLLIN)
@@ -136,7 +136,7 @@ class Gate:
                 event, descriptor = EVENT.unpack(monitor.recv_multipart()[0])
                 if event == zmq.EVENT_MONITOR_STOPPED:
                     left -= 1
-                elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:  # whose is not told
+                elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:  # ZeroMQ does not say of which
                     self._moved = time.monotonic()
                 else:
                     self._open.discard(descriptor)
@@ -146,7 +146,8 @@ class Gate:
 
     def _accepted(self, descriptor: int) -> None:
         self._open.add(descriptor)
-        # What is closed meanwhile is told next; its descriptor may be of something else by now.
+        # The connection may be closed already, and the number of its descriptor used again. Then
+        # the next event tells that it was closed.
         with suppress(OSError), _connection(descriptor) as found:
             self._waiting[descriptor] = _named(found.getpeername())
         if len(self._open) > self._room.connections:
@@ -156,7 +157,7 @@ class Gate:
             self._make_room()
 
     def _make_room(self) -> None:
-        """Strike out one that has shown its key meanwhile, or end one."""
+        """Remove one waiting connection from the list: authenticated by now, or ended here."""
         first, last = next(iter(self._waiting)), next(reversed(self._waiting))
         with suppress(OSError), _connection(first) as found:
             if _let_in(found):
@@ -167,7 +168,7 @@ class Gate:
         self._end(last if workers else first, "refused_handshakes", reason)
 
     def _end(self, descriptor: int, counter: str, reason: str) -> None:
-        """End a connection, unless it is another one by now, or has shown a key."""
+        """End a connection, unless it is authenticated or the descriptor is another one now."""
         address = self._waiting.pop(descriptor, None)
         with suppress(OSError), _connection(descriptor) as found:
             mine = _door(_named(found.getsockname())) in self._doors
@@ -178,24 +179,24 @@ class Gate:
 
 
 def _named(address: tuple[str, int] | str) -> str:
-    """Host and port, or a path, empty for the other side of a unix socket."""
+    """Host and port as text; for a unix socket its path, empty for the client's side."""
     return address if isinstance(address, str) else f"{address[0]}:{address[1]}"
 
 
 def _door(endpoint: str) -> str:
-    """What tells the sockets of this process apart, on whatever address: a port, or a path."""
+    """A socket's port or path, which tells the sockets of this process apart on any address."""
     return endpoint.removeprefix("ipc://").rpartition(":")[2]
 
 
 def _connection(descriptor: int) -> socket.socket:
-    """A second handle of a connection, which stays this one's when the first is closed."""
+    """A second descriptor of a connection, which stays valid when the first is closed."""
     return socket.socket(fileno=os.dup(descriptor))
 
 
 def _let_in(connection: socket.socket) -> bool:
-    """Whether the master has taken the key of an encrypted connection."""
+    """Whether an encrypted connection is authenticated, by the number of bytes sent on it."""
     info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, SENT_AT + SENT.size)
     if len(info) < SENT_AT + SENT.size:
-        return True  # Linux before 4.19 does not tell
+        return True  # unknown before Linux 4.19
     sent, again = SENT.unpack_from(info, SENT_AT)
     return int(sent - again) >= LET_IN

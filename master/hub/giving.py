@@ -1,4 +1,4 @@
-"""tangram-keys: keys for others, made and revoked while a run goes on."""
+"""tangram-keys: makes and revokes keys of other users, also while a run is in progress."""
 
 import fcntl
 import json
@@ -27,21 +27,21 @@ from tangram_core.store.files import private, write_whole
 from tangram_core.wire.messages import ROLES
 
 TCP = "tcp://"
-NEEDLESS = "nobody needs them: the master asks for none (unix sockets, or service.auth=off)"
+NEEDLESS = "these keys are not needed: the master uses unix sockets, or service.auth=off"
 STALE = (
-    "service.port is 0, any free port: when the master is started again this file is stale; start "
-    "it with service.port=5577, or another, for files that last"
+    "service.port is 0, any free port, so this file is stale when the master is started again; "
+    "start the master with a fixed port, as with service.port=5577, for files that last"
 )
 
 
 def change_keys(config: KeysConfig) -> list[str]:
-    """Make a key, revoke one, or neither.
+    """Make a key, revoke a key, or list the keys, as the config says.
 
     Returns:
-        Lines for the user; without a change who has keys.
+        Lines for the user; the list of keys if nothing was to be changed.
 
     Raises:
-        TangramError: nothing was changed.
+        TangramError: the change is not possible; nothing was changed.
     """
     folder = RunFolder(config.run_dir)
     if not folder.keys.exists():
@@ -67,17 +67,19 @@ def _no_keys(folder: RunFolder) -> str:
     if not folder.config.exists():
         return f"there is no run at {path}: run_dir= takes the folder of a run, as in runs/my_run"
     if folder.result.exists() and not folder.connection.exists():
-        return f"run {path.name} has ended, and nobody needed a key"
+        return f"run {path.name} has ended, and it had no keys"
     return (
-        f"{path} has no keys: they are made when its master first listens on an address, as with "
-        "service.bind=0.0.0.0; on unix sockets none are needed"
+        f"{path} has no keys: they are made when its master first listens on a network address, as "
+        "with service.bind=0.0.0.0; unix sockets need no keys"
     )
 
 
 def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[str]:
     out = Path(config.out or f"{name}.json").absolute()
     if name in ROLES or name in keys.given:
-        raise ConfigError(f"there is a key of {name}: revoke it first, or choose another name")
+        raise ConfigError(
+            f"{name} has a key already: revoke that key first, or choose another name"
+        )
     if not NAME.fullmatch(name):
         raise ConfigError(
             f"add must be a name of at most 64 letters, digits, dots, dashes and underscores, got "
@@ -88,8 +90,8 @@ def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[s
         given = old.values() if isinstance(old, dict) else []
         publics = {str(one.get("public")) for one in given if isinstance(one, dict)}
         former = publics and not holders(keys).keys() & publics
-        remedy = "delete it (its key is none of this run any more), or " if former else ""
-        raise ConfigError(f"out={out} is there already: {remedy}name another file with out=")
+        remedy = "delete it (its key is not valid in this run any more), or " if former else ""
+        raise ConfigError(f"out={out} exists already: {remedy}name another file with out=")
     connection, pair = _connection(folder), make_pair()
     given = {**keys.given, name: Given(config.role, pair.public)}
     mine = connection | {"keys": {config.role: asdict(pair)}}
@@ -97,7 +99,7 @@ def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[s
     write_keys(folder.keys, replace(keys, given=given))
     write_line(folder.audit, "key added", key=name, role=config.role)
     line = f"tangram-worker {argument('connect', out.name)} role={config.role}"
-    told = [f"{out} lets {name} take part as {config.role} ({line}): hand it on by a private way"]
+    told = [f"{out} lets {name} take part as {config.role} ({line}): send it over a private way"]
     if connection.get("settings", {}).get("service", {}).get("port") == 0:
         told.append(STALE)
     return told
@@ -106,11 +108,11 @@ def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[s
 def _revoke(folder: RunFolder, keys: Keys, name: str) -> str:
     if name not in keys.given:
         known = ", ".join(keys.given) or "none"
-        raise ConfigError(f"revoke must name a key that was made here ({known}), got '{name}'")
+        raise ConfigError(f"revoke must name a key made by tangram-keys ({known}), got '{name}'")
     given = {one: key for one, key in keys.given.items() if one != name}
     write_keys(folder.keys, replace(keys, given=given))
     write_line(folder.audit, "key revoked", key=name)
-    return f"{name} may take part no longer"
+    return f"the key of {name} is revoked"
 
 
 def _connection(folder: RunFolder) -> dict[str, Any]:
@@ -118,13 +120,13 @@ def _connection(folder: RunFolder) -> dict[str, Any]:
     if str(content.get("endpoint")).startswith(TCP) and "server_key" in content:
         return content
     raise RunError(
-        f"no master of {folder.path} listens on an address with keys: start it, as with "
-        "service.bind=0.0.0.0; a connection file names its address"
+        f"no master of {folder.path} listens on a network address with keys: start it, as with "
+        "service.bind=0.0.0.0; the connection file needs its address"
     )
 
 
 def _content(path: Path, otherwise: dict[str, Any]) -> dict[str, Any]:
-    """Of a connection file."""
+    """The content of a connection file, `otherwise` if it cannot be read."""
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except UNREADABLE:
@@ -133,7 +135,7 @@ def _content(path: Path, otherwise: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def _alone(folder: RunFolder) -> Iterator[None]:
-    """Two commands at a time would lose a change."""
+    """Lock the keys: two commands at the same time would lose a change."""
     with open(folder.path / ".keys.lock", "ab", opener=private) as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

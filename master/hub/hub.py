@@ -1,11 +1,10 @@
 """The master's sockets: ROUTER for episodes, scores and control, PUB for weights.
 
-Whatever a peer sends, `poll` does not raise: what is wrong is answered with a reason, counted by
-name, and forgotten. A peer that does not read its answers loses them and nobody waits for it: the
-worker asks again.
+Wrong messages never make `poll` raise: a wrong message is answered with a reason, counted by name
+and dropped. Sends never wait: a peer that does not read loses its answers, and must ask again.
 
-Delivery: see `delivery`. A batch is acknowledged only by `acknowledge`, after it was
-journalled and inserted, and the unacknowledged batches of one peer are bounded by `window`.
+Delivery: see `delivery`. A batch is acknowledged only by `acknowledge`, after it was journalled and
+inserted. The number of unacknowledged batches of one peer is limited by `window`.
 """
 
 import secrets
@@ -51,28 +50,28 @@ from tangram_core.wire.messages import (
 )
 from tangram_core.wire.schema import DamagedError, ProtocolError
 
-# What one poll spends under any load on reading and on answering, so that the loop gets its turn.
+# Time of one poll for reading and for answering under any load, so that the loop goes on.
 READ_S, SERVE_S = 0.005, 0.01
-MESSAGE_S = 0.1  # that one costs at most; else the process was stopped meanwhile
-# Bytes of one key that are read and not answered yet; what is more is dropped, and sent again by
-# those that keep the rules. A message counts for so much at least.
+MESSAGE_S = 0.1  # largest cost counted for one message; if longer, the process was stopped
+# Most bytes of one key that are read but not answered. Messages beyond that are dropped, and a
+# correct worker sends them again. Each message counts for LEAST_BYTES at least.
 INBOX_BYTES, LEAST_BYTES = 128 * 2**20, 1024
-# Damaged messages of one peer without an intact batch between them: then it must end.
+# A peer must end after so many damaged messages without an intact batch between them.
 MAX_DAMAGED = 100
-# Of broadcasts to all workers together: half of a gigabit line, and what a fifteenth of a core
-# encrypts. Many workers have somewhat older weights rather than a slower learner.
+# Bandwidth of broadcasts to all workers together: half of a gigabit line, and a fifteenth of a
+# core for encryption. With many workers, weights get somewhat older, but learning does not slow.
 BROADCAST_BYTES_S = 60e6
 
 
 class Hub:
-    """The master's end of all conversations.
+    """The master's side of the communication with workers, evaluators and tangram-status.
 
     Attributes:
-        endpoint: of the ROUTER socket, as bound.
-        weights_endpoint: of the PUB socket, as bound.
-        epoch: random id of this life of the master.
-        counters: traffic and refusals by name.
-        open_to_all: whoever reaches the port may take part.
+        endpoint: address of the ROUTER socket, as bound.
+        weights_endpoint: address of the PUB socket, as bound.
+        epoch: random id of this master process; a restarted master has another one.
+        counters: numbers of messages and refusals by name.
+        open_to_all: whether anyone who reaches the port may take part.
     """
 
     def __init__(
@@ -89,12 +88,12 @@ class Hub:
 
         Args:
             bind: address to listen on.
-            port: of the ROUTER, and the next one of the PUB; 0 for any.
-            info: what joiners are told, and must agree with.
-            silence_s: after which a peer is forgotten.
-            keys: for encrypted sockets, None for plain ones.
-            room: for those who take part.
-            audit: of who joins, leaves and is refused.
+            port: port of the ROUTER; the PUB has the next one. 0 for any free ports.
+            info: data that joining processes receive and must agree with.
+            silence_s: seconds without a message after which a peer is removed.
+            keys: keys for encrypted sockets; None for plain sockets.
+            room: limits on connections and peers.
+            audit: log of peers that join, leave or are refused.
         """
         self.epoch = secrets.token_hex(8)
         self._info = info
@@ -128,28 +127,28 @@ class Hub:
         return self._registry.peers
 
     def count(self, role: str) -> int:
-        """How many of a role take part."""
+        """Number of peers with a role."""
         return self._registry.count(role)
 
     @property
     def keys(self) -> Keys | None:
-        """As their file has them by now; None on plain sockets."""
+        """The keys as last read from their file; None on plain sockets."""
         return self._sockets.keys
 
     @property
     def broadcast_s(self) -> float:
-        """How long the newest weights take to all who take part, at `BROADCAST_BYTES_S`."""
+        """Seconds to send the newest weights to all peers, at `BROADCAST_BYTES_S`."""
         size = sum(map(len, self._weights or ()))
         return size * len(self._registry) / BROADCAST_BYTES_S
 
     def poll(self, timeout_s: float) -> list[Arrival]:
-        """Wait for a message, answer what is there; returns what is new, in the order it came."""
+        """Wait up to `timeout_s` for messages and answer them; returns new batches and scores."""
         self._sockets.listen_again()
-        self._admission.drop_revoked()  # first: a flood must not keep anybody in
+        self._admission.drop_revoked()  # first, so that a flood of messages cannot delay it
         if len(self._inbox) or self._sockets.wait(timeout_s):
             all_read = self._read()
             arrivals = self._serve()
-            if len(self._inbox) or not all_read:  # perhaps of those who seem silent
+            if len(self._inbox) or not all_read:  # peers that seem silent may have messages here
                 return arrivals
         else:
             arrivals = []
@@ -157,19 +156,19 @@ class Hub:
         return arrivals
 
     def acknowledge(self, arrival: EpisodesArrived) -> None:
-        """Tell the worker that its batch is safe; once for each arrival, after its insert."""
+        """Acknowledge a batch to its worker; call once for each arrival, after the insert."""
         key = (arrival.role, arrival.index)
         self._waiting.done(arrival)
         ledger = self._registry.ledger(key, arrival.incarnation)
         if ledger is None or not ledger.release(arrival.sequence):
-            return  # a newer process has the index, or this was told before
+            return  # a newer process has the index, or the batch was acknowledged before
         peer = self._registry.at(key)
         if peer is not None:
             peer.inserted(arrival)
             self._sockets.answer(peer.identity, Ack(arrival.sequence, duplicate=False))
 
     def publish(self, weights: Weights) -> None:
-        """Broadcast weights, and keep them for those who join later; WireError as in encoding."""
+        """Broadcast weights, and keep them for later requests; WireError if out of bounds."""
         self._weights = WeightsMessage(self.epoch, weights).encode()
         self._version = weights.version
         self._exams.published(weights.version)
@@ -177,44 +176,44 @@ class Hub:
         self.counters["published"] += 1
 
     def order(self, orders: Mapping[int, Go]) -> None:
-        """In lockstep: tell players what to play next, by index, until their batches come."""
+        """In lockstep: send each player (by index) its order, again until its batch comes."""
         self._orders = dict(orders)
         for peer in self.peers:
             self._remind(peer)
 
     def tell(self, status: RunStatus) -> None:
-        """Answer with this whoever asks how the run stands."""
+        """Set the status that is sent to processes that ask for one."""
         self._status = status.encode()
 
     def stop(self, reason: str) -> None:
-        """Tell all peers to end, and from now on whoever says anything.
+        """Tell all peers to end, and answer each later message in the same way.
 
-        They leave with BYE: poll until `peers` is empty or your patience ends.
+        Peers leave with BYE: call `poll` until `peers` is empty or a time limit is over.
         """
         self._stop_reason = reason
         for peer in self.peers:
             self._sockets.answer(peer.identity, Stop(reason))
 
     def state(self) -> dict[str, dict[str, int | str]]:
-        """The table of duplicates, for a checkpoint."""
+        """The table of inserted batches, for a checkpoint; it serves to find duplicates."""
         return self._registry.state()
 
     def load_state(self, state: Mapping[str, Mapping[str, int | str]]) -> None:
-        """Take a checkpoint's table of duplicates, before the first poll; RunError if malformed."""
+        """Load a checkpoint's table of batches, before the first poll; RunError if malformed."""
         self._registry.load_state(state, time.monotonic())
 
     def recover(self, arrival: EpisodesArrived) -> bool:
-        """Note a batch of the journal, before the first poll; False if it was inserted before."""
+        """Register a batch of the journal, before the first poll; False if it is a duplicate."""
         key = (arrival.role, arrival.index)
         sent, by = (arrival.incarnation, arrival.sequence), (arrival.process, arrival.owner)
         return self._registry.recover(key, *sent, time.monotonic(), *by)
 
     def close(self) -> None:
-        """Close the sockets; answers that are on their way get a second."""
+        """Close the sockets; queued answers get one second to be sent."""
         self._sockets.close()
 
     def _read(self) -> bool:
-        """Take what came into the inbox; False if there is more."""
+        """Move received messages to the inbox, for `READ_S` at most; False if more are left."""
         until_s = time.monotonic() + READ_S
         while (received := self._sockets.receive()) is not None:
             key, size = received.holder.name, max(LEAST_BYTES, sum(map(len, received.frames)))
@@ -228,7 +227,7 @@ class Hub:
         return True
 
     def _serve(self) -> list[Arrival]:
-        """Answer what was read, each key for an equal time; returns what is new."""
+        """Answer messages of the inbox, each key for an equal time; returns new arrivals."""
         arrivals: list[Arrival] = []
         begun_s = last_s = time.monotonic()
         while len(self._inbox):
@@ -244,7 +243,7 @@ class Hub:
         return arrivals
 
     def _heard(self, received: Received) -> Arrival | None:
-        """Read a message, if its sender still has a key; returns what is new."""
+        """Handle a message if its sender's key is still valid; returns a new arrival, or None."""
         identity, frames, holder, self._address = received
         if holder.revoked:
             self._admission.revoke(identity, holder.name)
@@ -253,7 +252,7 @@ class Hub:
         return self._receive(identity, frames)
 
     def _receive(self, identity: bytes, frames: Sequence[bytes]) -> Arrival | None:
-        """Read a message and answer it; returns what is new."""
+        """Decode and answer a message; returns a new arrival, or None."""
         message: ToMaster | BatchError
         try:
             if len(frames) > 1 + MAX_FRAMES:
@@ -274,7 +273,7 @@ class Hub:
     def _dispatch(
         self, identity: bytes, message: ToMaster | BatchError, frames: Sequence[bytes]
     ) -> Arrival | None:
-        """Those who need not take part, and those who may not any more."""
+        """Handle messages that need no membership; pass the others of a peer to `_talk`."""
         peer = self._admission.find(identity, self._caller)
         if isinstance(message, AskStatus):
             if not self._askers[self._caller.name].may_have(identity, time.monotonic()):
@@ -286,7 +285,8 @@ class Hub:
             if peer is not None:
                 self._admission.leave(peer, message.reason)
         elif self._stop_reason is not None:
-            # Batches, too, right and wrong ones: none is taken, so none may be refused for good.
+            # Batches get this answer, too, even wrong ones. They are not read any more, so the
+            # worker must keep them.
             self._sockets.answer(identity, Stop(self._stop_reason))
         elif isinstance(message, Hello):
             who = (self._caller, self._address, self.epoch)
@@ -330,10 +330,10 @@ class Hub:
         return None
 
     def _scores(self, peer: Peer, scores: Scores) -> ScoresArrived | None:
-        """Scores, once for each of the published weights."""
+        """Check scores: an evaluator may score each published version of the weights once."""
         odd = scores.scalars.keys() - self._info.scores - set(COUNTS)
         if odd:
-            self._reject(peer, 0, f"scores: the task has none that is called {min(odd)}")
+            self._reject(peer, 0, f"scores: the task has no score named {min(odd)}")
             return None
         peer.damaged = 0
         if reason := self._exams.take(scores.weights_version, peer.index):
@@ -345,7 +345,7 @@ class Hub:
     def _batch(
         self, peer: Peer, batch: EpisodeBatch, frames: Sequence[bytes]
     ) -> EpisodesArrived | None:
-        """The batch, if it is the next one; else what the worker must know is answered."""
+        """Accept a batch if it is the next one; else answer the worker and return None."""
         peer.damaged = 0
         if self._info.lockstep and not self._is_ordered(peer, batch):
             return None
@@ -367,42 +367,42 @@ class Hub:
         return arrival
 
     def _is_ordered(self, peer: Peer, batch: EpisodeBatch) -> bool:
-        """Whether a new batch is what the player was told to play; else it is told again."""
+        """Whether a batch matches the player's order; else reject it and repeat the order."""
         if peer.ledger.judge(batch.sequence, self._info.window) is not Verdict.NEW:
-            return True  # it was, when it was new
+            return True  # an old batch, which was checked when it was new
         order, number = self._orders.get(peer.index), batch.sequence
         if order is None:
-            # After a restart its order may come soon: it is not refused for good.
-            reason = f"batch {number}: nothing is ordered of it now"
+            # Not final: after a restart of the master, the order may follow soon.
+            reason = f"batch {number}: this player has no order now"
             self._reject(peer, number, reason, "not_ordered", final=False)
             return False
         if (batch.episodes.count, batch.weights_version) == (order.episodes, order.version):
             return True
         peer.ledger.consume(number)
         reason = (
-            f"batch {number}: {batch.episodes.count} episodes with weights "
-            f"{batch.weights_version}, ordered were {order.episodes} with weights {order.version}"
+            f"batch {number}: {batch.episodes.count} episodes with weights {batch.weights_version}"
+            f", but the order was {order.episodes} with weights {order.version}"
         )
         self._reject(peer, number, reason, "not_ordered")
         self._remind(peer)
         return False
 
     def _broken(self, peer: Peer, error: BatchError) -> None:
-        """A batch with wrong content: it must not come again, and those after it need not wait."""
+        """Refuse a batch with wrong content for good, so that the batches after it can follow."""
         final = peer.ledger.judge(error.sequence, self._info.window) is Verdict.NEW
         if final:
             peer.ledger.consume(error.sequence)
         self._reject(peer, error.sequence, f"batch {error.sequence}: {error}", final=final)
 
     def _damaged(self, identity: bytes, error: DamagedError) -> None:
-        """Told, so that what was meant comes again soon, unless that happens time after time."""
+        """Ask for a damaged message again; stop a peer after too many of them in a row."""
         peer = self._registry.find(identity)
         if peer is not None:
             peer.damaged += 1
             if peer.damaged >= MAX_DAMAGED:
                 reason = (
                     f"{peer.damaged} messages of {peer.name} in a row were damaged on their way: "
-                    "look at the memory and the network of its machine"
+                    "check the memory and the network of its machine"
                 )
                 self._sockets.refuse(identity, "damaged", Stop(reason))
                 return
@@ -415,6 +415,6 @@ class Hub:
         self._sockets.refuse(peer.identity, counter, answer)
 
     def _remind(self, peer: Peer) -> None:
-        """In lockstep: tell a player, who may have missed it, what is still to play."""
+        """In lockstep: send a player its order again, in case the player missed it."""
         if peer.role == "player" and peer.index in self._orders:
             self._sockets.answer(peer.identity, self._orders[peer.index])

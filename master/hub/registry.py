@@ -1,10 +1,10 @@
-"""Who takes part: indices, incarnations and connections; no sockets.
+"""The registry of peers: their indices, incarnations and connections, without sockets.
 
-Each role counts its own indices. A new process of an index gets the next incarnation and wins over
-the older one; a process that comes back after the master was restarted keeps what it had, unless
-the master has lost it (a disk without power): then it gets the next one, too. No process names one
-that was never given. An index stays with the key that had it first: no other key goes on with its
-batches, or begins anew there.
+Each role has its own indices. A new process with an index gets the next incarnation and replaces
+the older process. A process that reconnects after a restart of the master keeps its incarnation. If
+the master has lost that number (in a power cut), the process gets the next one. A process can keep
+only an incarnation that a master gave. An index stays with the first key that had it: no other key
+may continue its batches or start there again.
 """
 
 import logging
@@ -17,10 +17,10 @@ from tangram_core.errors import RunError, TangramError
 from tangram_core.wire.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_core.wire.schema import MAX_COUNT
 
-CROWDED = 0.9  # share of the room from which on there is a warning
-# One that asks for weights again before it has shown that it got them waits so long, then twice.
+CROWDED = 0.9  # a warning is logged when this share of the room is taken
+# A peer that asks again for weights and does not show that it got them waits so long, then twice.
 WEIGHTS_AGAIN_S = 10.0
-# Answers about the run: so many in this time over all who ask, and one for each connection.
+# Status answers to one key in STATUS_AGAIN_S: so many in all, and one for each connection.
 STATUS_ANSWERS, STATUS_AGAIN_S = 64, 0.5
 ANOTHER_KEY = "takes part with another key: leave index out, or choose another"
 Key = tuple[str, int]
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 class RefusedError(TangramError):
-    """A process that may not take part: the counter of such refusals, and the answer to it."""
+    """A process may not take part; holds the name of the counter and the answer to send."""
 
     def __init__(self, counter: str, answer: Refused | Stop) -> None:
         super().__init__(answer.reason)
@@ -38,19 +38,22 @@ class RefusedError(TangramError):
 
 @dataclass(eq=False)
 class Peer:
-    """A connected process.
+    """A process that takes part: a player or an evaluator.
 
     Attributes:
-        process: its random id.
-        last_seen: monotonic seconds.
-        stats: numbers of its last heartbeat.
-        weights_version: that its last batch was played with.
-        batches, episodes, transitions: inserted since it joined.
-        damaged: messages in a row that were damaged on their way.
-        holder: name of the key that it joined with, empty where there are none.
-        address: where it is; None before it has joined.
-        weights: version that it was sent when it asked, and when it may have more if it does not
-            show that it got them.
+        role, index: its place in the run.
+        incarnation: counts the processes that had this index, from 1.
+        process: random id of the process.
+        identity: ZeroMQ's name of its connection.
+        last_seen: monotonic time of its last message in seconds.
+        stats: numbers of the last heartbeat.
+        weights_version: version of the weights that played its last batch; -1 before.
+        batches, episodes, transitions: numbers inserted since the process joined.
+        damaged: number of damaged messages in a row.
+        holder: name of the key that it joined with; empty if the run has no keys.
+        address: its network address; None before it has joined.
+        weights: version last sent on request, and the time before which requests that do not show
+            this version are ignored.
     """
 
     role: str
@@ -72,9 +75,9 @@ class Peer:
     _patience_s: float = WEIGHTS_AGAIN_S
 
     def may_have(self, version: int, shown: int) -> bool:
-        """Whether to send it weights of a version; it shows which it has.
+        """Whether to send weights `version` to a peer that says it has `shown`; counts as sent.
 
-        What is sent to one that does not read stays in memory here.
+        Requests are limited because messages to a peer that does not read stay in memory here.
         """
         sent, due = self.weights
         if shown < sent and self.last_seen < due:
@@ -84,7 +87,7 @@ class Peer:
         return True
 
     def inserted(self, arrival: EpisodesArrived) -> None:
-        """Count a batch of its own."""
+        """Count an inserted batch of this peer."""
         self.batches += 1
         self.episodes += arrival.episodes.count
         self.transitions += arrival.episodes.transitions
@@ -96,17 +99,17 @@ class Peer:
 
     @property
     def name(self) -> str:
-        """Role and index in words, for messages to people."""
+        """Role and index as text for messages, such as `player 3`."""
         return f"{self.role} {self.index}"
 
 
 class Registry:
-    """Peers by connection and by index, and the ledger of batches of each, for a checkpoint.
+    """The peers by connection and by index, and the ledger of batches of each index.
 
-    After a restart indices wait `grace_s` for their workers.
+    After a restart of the master, each index stays reserved for its worker for `grace_s` seconds.
 
     Attributes:
-        lost_batches: numbers that a checkpoint had not seen and a worker has no more.
+        lost_batches: number of acknowledged batches that neither the run nor their worker has.
     """
 
     def __init__(self, fingerprints: Mapping[str, str], grace_s: float, room: Room = AMPLE) -> None:
@@ -121,67 +124,67 @@ class Registry:
 
     @property
     def peers(self) -> list[Peer]:
-        """Live ones, by role and index."""
+        """The connected peers, sorted by role and index."""
         return [self._by_key[key] for key in sorted(self._by_key)]
 
     def __len__(self) -> int:
-        """How many are live."""
+        """Number of connected peers."""
         return len(self._by_key)
 
     def count(self, role: str) -> int:
-        """How many of a role are live."""
+        """Number of connected peers with a role."""
         return sum(one == role for one, _ in self._by_key)
 
     def find(self, identity: bytes) -> Peer | None:
-        """The peer of a connection."""
+        """The peer of a connection, or None."""
         return self._by_identity.get(identity)
 
     def at(self, key: Key) -> Peer | None:
-        """The peer of an index."""
+        """The peer with this role and index, or None."""
         return self._by_key.get(key)
 
     def ledger(self, key: Key, incarnation: int) -> Ledger | None:
-        """The batches of an incarnation, unless a newer one has begun."""
+        """The ledger of an incarnation; None if the index has a newer incarnation."""
         ledger = self._ledgers.get(key)
         return ledger if ledger is not None and ledger.incarnation == incarnation else None
 
     def admit(
         self, identity: bytes, hello: Hello, now: float, owner: str = ""
     ) -> tuple[Peer, Peer | None]:
-        """Take a process in: the newest of an index wins.
+        """Admit a process; a new process replaces an older one with the same index.
 
         Args:
-            identity: its connection.
-            hello: what it says.
-            now: monotonic seconds.
-            owner: name of its key.
+            identity: of the connection.
+            hello: message of the process.
+            now: monotonic time in seconds.
+            owner: name of the process's key.
 
         Returns:
-            The peer, and the older process that it took the index from.
+            The peer, and the older peer that had the index, or None.
 
         Raises:
-            RefusedError: other settings, too many peers, or an index that belongs to a newer
-                incarnation, or to another key.
+            RefusedError: the settings differ, there are too many peers, or the index belongs to a
+                newer incarnation or to another key.
         """
         self._check_settings(hello)
         same = next((p for p in self._by_key.values() if p.process == hello.process), None)
         if same is not None and same.role == hello.role:
-            # A HELLO again, because WELCOME was late or the connection is a new one.
+            # The process repeats its HELLO: WELCOME was late, or the connection is new.
             self._by_identity.pop(same.identity, None)
             same.identity, same.last_seen = identity, now
             self._by_identity[identity] = same
             return same, None
-        # One that takes an index over needs no more room: its predecessor leaves.
+        # A process that takes an index over needs no extra room: the older process leaves.
         takes_over = (hello.role, hello.index) in self._by_key
         if len(self._by_key) >= self._room.peers and not takes_over:
-            reason = f"{self._room.peers} processes take part already, the most {self._room.bound}"
+            reason = f"{self._room.peers} processes take part, the most {self._room.bound}"
             raise RefusedError("refused_full", Refused(reason, later=True))
         stranger = self._by_identity.get(identity)
         if stranger is not None:
             self.leave(stranger)
         index = hello.index if hello.index >= 0 else self._free_index(hello.role, now, owner)
         key = (hello.role, index)
-        # What the run starts itself has its place: a key that was given away gets another.
+        # The run's own workers (keys in ROLES) may take their index back from any other key.
         if key in self._ledgers and not self._ledgers[key].is_of(owner) and owner not in ROLES:
             reason = f"{hello.role} {index} {ANOTHER_KEY}"
             raise RefusedError("refused_keys", Refused(reason))
@@ -195,21 +198,21 @@ class Registry:
         return peer, older
 
     def leave(self, peer: Peer) -> None:
-        """Forget a connection; its ledger stays, unless no batch of its index was ever taken."""
+        """Remove a peer; keep the ledger if a batch of the index was ever accepted."""
         self._by_identity.pop(peer.identity, None)
         self._by_key.pop(peer.key, None)
         if peer.ledger.unused and self._ledgers.get(peer.key) is peer.ledger:
             del self._ledgers[peer.key]
 
     def drop_silent(self, now: float, silence_s: float) -> list[Peer]:
-        """Forget the peers that were not heard of for so long, and return them."""
+        """Remove and return the peers that sent no message for `silence_s` seconds."""
         silent = [p for p in self._by_key.values() if now - p.last_seen > silence_s]
         for peer in silent:
             self.leave(peer)
         return silent
 
     def state(self) -> dict[str, dict[str, int | str]]:
-        """Last incarnation, its process and its last inserted batch, of each index."""
+        """For each index: last incarnation, last inserted batch, process and key."""
         return {
             f"{role}/{index}": {
                 "incarnation": ledger.incarnation,
@@ -221,7 +224,7 @@ class Registry:
         }
 
     def load_state(self, state: Mapping[str, Mapping[str, int | str]], now: float) -> None:
-        """Take a checkpoint's ledgers, whose indices wait for workers; RunError if malformed."""
+        """Load a checkpoint's ledgers and reserve their indices; RunError if malformed."""
         self._ledgers = {_key(name): _ledger(name, entry) for name, entry in state.items()}
         self._reserved_until = now + self._grace_s
 
@@ -234,13 +237,13 @@ class Registry:
         process: str = "",
         owner: str = "",
     ) -> bool:
-        """Note a batch of the journal as inserted; False if the table has it already."""
+        """Register a batch of the journal as inserted; False if it is a duplicate."""
         ledger = self._ledgers.get(key)
         if ledger is None or incarnation > ledger.incarnation:
             ledger = self._ledgers[key] = Ledger(incarnation, process=process, owner=owner)
         known = self._recovered.get((key, incarnation), 0)
-        # A process that was taken over may have had a batch here that was not inserted yet, so that
-        # the checkpoint has it not: what is read here was journalled after it.
+        # A batch of an older incarnation may have waited here when the checkpoint was written. The
+        # batches read here were journalled after that, so this one is not in the checkpoint.
         if sequence <= (known if incarnation < ledger.incarnation else ledger.received):
             return False
         self._recovered[key, incarnation] = sequence
@@ -250,7 +253,7 @@ class Registry:
         return True
 
     def _warn_early(self) -> None:
-        """Once, before anybody must be refused."""
+        """Log one warning before the room is full."""
         taken, most = len(self._by_key), self._room.peers
         if not self._crowded and taken >= CROWDED * most:
             self._crowded = True
@@ -270,7 +273,7 @@ class Registry:
         )
         reason = (
             f"its settings of {listed} differ from the master's ({'; '.join(digests)}): leave them "
-            "out, for connect=RUN_DIR brings the master's, or start both with the same overrides "
+            "out, since connect=RUN_DIR loads the master's, or start both with the same overrides "
             f"of {listed}"
         )
         raise RefusedError("refused_settings", Refused(reason))
@@ -292,7 +295,7 @@ class Registry:
             if known == MAX_COUNT:
                 reason = f"{key[0]} {key[1]} has no incarnation left: start with another index"
                 raise RefusedError("refused_full", Refused(reason))
-            # Nothing is known of what a new process has sent, nor of a forgotten incarnation.
+            # For a new process, numbers start at 1; for a lost incarnation, at the worker's first.
             received = hello.first - 1 if hello.incarnation else 0
             ledger = Ledger(known + 1, received, unused=last is None or last.unused)
         elif hello.incarnation < known or last.process not in ("", hello.process):
@@ -302,7 +305,7 @@ class Registry:
             raise RefusedError("superseded", Stop(reason))
         else:
             ledger = last
-            # Acknowledged after the checkpoint was written, so the worker has them no more.
+            # Batches acknowledged after the checkpoint: the worker has deleted them.
             self.lost_batches += ledger.skip_to(hello.first)
         ledger.process, ledger.owner = hello.process, owner
         self._ledgers[key] = ledger
@@ -310,13 +313,13 @@ class Registry:
 
 
 class Askers:
-    """Those who were told how the run stands a moment ago; they need not take part."""
+    """Limits how often the status is sent to processes that ask; they need not be peers."""
 
     def __init__(self) -> None:
         self._told = dict[bytes, float]()  # connection -> when, oldest first
 
     def may_have(self, identity: bytes, now: float) -> bool:
-        """Whether to tell a connection now; what it does not read stays in memory here."""
+        """Whether to answer a connection now, which counts as an answer; False if too many."""
         while self._told and now - next(iter(self._told.values())) >= STATUS_AGAIN_S:
             del self._told[next(iter(self._told))]
         if identity in self._told or len(self._told) >= STATUS_ANSWERS:

@@ -1,8 +1,8 @@
-"""Who may connect at all: CURVE encryption, its keys, and ZeroMQ's authentication (ZAP).
+"""Authentication of connections: CURVE encryption, its keys, and ZeroMQ's protocol ZAP.
 
-A run has the server's pair of keys, one for each role that its own workers share, and those that
-tangram-keys made for others. They live as long as the run, so that a worker may come back after the
-master was restarted.
+A run has a pair of keys for the master, and one pair for each role, which the run's own workers
+share. tangram-keys makes more keys for other users. All are valid as long as the run lasts, so that
+a worker can reconnect after a restart of the master.
 """
 
 import hashlib
@@ -39,15 +39,15 @@ DOMAIN = "tangram"
 MAX_SOCKET_PATH = 107  # bytes, of Linux
 NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")  # of a key
 KEY_BYTES = 32
-STALE_S = 24 * 3600.0  # of a socket that nobody listens on
-LOOK_S = 1.0  # between two looks at the file of keys
+STALE_S = 24 * 3600.0  # age at which an unused socket file is deleted
+LOOK_S = 1.0  # between two checks of the key file
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """CURVE keys, 40 characters of Z85 each; the secret one is never shown."""
+    """A pair of CURVE keys, 40 characters of Z85 each; `repr` omits the secret one."""
 
     public: str
     secret: str = field(repr=False)
@@ -55,7 +55,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Given:
-    """A key for a role that was made for somebody, who alone has its secret half."""
+    """A key that tangram-keys made, with its role; only the user has the secret half."""
 
     role: str
     public: str
@@ -63,11 +63,13 @@ class Given:
 
 @dataclass(frozen=True)
 class Keys:
-    """The keys of a run: of the master, of its own workers by role, and those that were given.
+    """The keys of a run.
 
     Attributes:
-        given: name -> key, of those that tangram-keys made.
-        path: where they are kept; changes there are followed.
+        server: key pair of the master.
+        player, evaluator: key pairs of the run's own workers, by role.
+        given: name -> key made by tangram-keys.
+        path: file of the keys; the master reads it again when it changes.
     """
 
     server: Pair
@@ -77,22 +79,22 @@ class Keys:
     path: Path | None = field(default=None, compare=False)
 
     def own(self) -> dict[str, Pair]:
-        """Role -> the pair of the run's own workers."""
+        """Role -> key pair of the run's own workers."""
         return {role: getattr(self, role) for role in ROLES}
 
     def content(self) -> dict[str, Any]:
-        """As the file holds them."""
+        """The content of the key file."""
         return {name: value for name, value in asdict(self).items() if name != "path"}
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who has a key.
+    """The holder of a key.
 
     Attributes:
-        name: empty where there are no keys.
-        role: it is for; empty for any, where there are no keys.
-        revoked: it was valid before.
+        name: of the key; empty if the run has no keys.
+        role: role that the key allows; empty for any role if the run has no keys.
+        revoked: whether the key is not valid any more.
     """
 
     name: str = ""
@@ -101,58 +103,58 @@ class Holder:
 
 
 def make_pair() -> Pair:
-    """A fresh one."""
+    """Make a new key pair."""
     return Pair(*(key.decode("ascii") for key in zmq.curve_keypair()))
 
 
 def make_keys() -> Keys:
-    """Fresh keys."""
+    """Make the keys of a new run."""
     return Keys(make_pair(), make_pair(), make_pair())
 
 
 def holders(keys: Keys) -> dict[str, Holder]:
-    """Public key -> who has it."""
+    """Public key -> its holder."""
     own = {pair.public: Holder(role, role) for role, pair in keys.own().items()}
     return own | {one.public: Holder(name, one.role) for name, one in keys.given.items()}
 
 
 def run_keys(path: Path) -> Keys:
-    """The keys of a run, see `read_keys`; made, for the user alone to read, the first time."""
+    """Read the keys of a run, see `read_keys`; make and write them if there is no file."""
     if not path.exists():
         write_keys(path, make_keys())
     return read_keys(path)
 
 
 def read_keys(path: Path) -> Keys:
-    """The keys in a file; RunError if it holds something else."""
+    """Read and check a key file; RunError if its content is invalid."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         keys = msgspec.convert(content, Keys)
         if keys.content() != content:
-            raise ValueError("it holds more")
+            raise ValueError("it has unknown entries")
         for pair in (keys.server, *keys.own().values()):
             if zmq.curve_public(pair.secret.encode()).decode() != pair.public:
-                raise ValueError("a public key is not that of its secret key")
+                raise ValueError("a public key does not match its secret key")
         for name, one in keys.given.items():
             if not NAME.fullmatch(name) or name in ROLES or one.role not in ROLES:
-                raise ValueError(f"'{name}' is no name, or its role is unknown")
+                raise ValueError(f"'{name}' is not a valid name, or its role is unknown")
             if len(z85.decode(one.public)) != KEY_BYTES:
-                raise ValueError(f"the key of {name} is none")
+                raise ValueError(f"the key of {name} has a wrong length")
     except (*UNREADABLE, struct.error, msgspec.MsgspecError, zmq.ZMQError) as error:
         raise RunError(
-            f"{path} does not hold the run's keys ({error}): delete it to make new ones; workers "
-            "that run now must then be started again"
+            f"{path} does not hold the run's keys ({error}): delete the file to make new keys, "
+            "then start the present workers again"
         ) from None
     return replace(keys, path=path)
 
 
 def write_keys(path: Path, keys: Keys) -> None:
-    """Keep keys in a file that only the user may read."""
+    """Write keys to a file that only the user can read."""
     write_whole(path, json.dumps(keys.content(), indent=1).encode(), PRIVATE)
 
 
 def needs_keys(service: ServiceConfig) -> bool:
-    """Whether who takes part must show a key, as on any address; ConfigError if ZeroMQ cannot."""
+    """Whether the settings ask for keys; ConfigError if ZeroMQ was built without encryption."""
     wanted = service.bind != LOCAL and service.auth == "on"
     if wanted and not zmq.has("curve"):
         raise ConfigError(
@@ -163,10 +165,10 @@ def needs_keys(service: ServiceConfig) -> bool:
 
 
 def listening_place(bind: str, run: Path) -> str:
-    """The address to listen on; for unix sockets the beginning of their paths.
+    """The address to listen on; for unix sockets, `ipc://` and the first part of their paths.
 
-    They lie in a folder that only this user may enter, and not in the run's, whose file system may
-    be shared and whose path too long. A run has the same ones in each of its lives.
+    Unix sockets are in a folder in TMPDIR that only this user can enter. The run folder may be on a
+    shared file system, or its path may be too long. After a restart a run has the same paths.
 
     Raises:
         TangramError: the folder of the sockets cannot be used.
@@ -176,8 +178,8 @@ def listening_place(bind: str, run: Path) -> str:
     folder, found = Path(tempfile.gettempdir()) / f"tangram-{os.geteuid()}", run.stat()
     if not str(folder).isprintable():
         raise ConfigError(
-            f"{os.fsencode(folder)!r} cannot hold sockets, whose paths are printable UTF-8: set "
-            "TMPDIR to another folder, such as /tmp"
+            f"{os.fsencode(folder)!r} cannot hold sockets, as their paths must be printable UTF-8: "
+            "set TMPDIR to another folder, such as /tmp"
         )
     own_folder(folder)
     _sweep(folder)
@@ -185,14 +187,14 @@ def listening_place(bind: str, run: Path) -> str:
     place = f"{folder}/{name[:12]}"
     if len(os.fsencode(f"{place}.episodes")) > MAX_SOCKET_PATH:
         raise ConfigError(
-            f"{folder} is too long for sockets, whose paths have {MAX_SOCKET_PATH} bytes at most: "
-            "set TMPDIR to a shorter one, such as /tmp"
+            f"{folder} is too long: paths of sockets have at most {MAX_SOCKET_PATH} bytes: set "
+            "TMPDIR to a shorter path, such as /tmp"
         )
     return IPC + place
 
 
 def _sweep(folder: Path) -> None:
-    """Remove sockets that masters left which were killed and never came back."""
+    """Delete old socket files of masters that were killed and not restarted."""
     for path in folder.iterdir():
         with suppress(OSError), socket.socket(socket.AF_UNIX) as end:
             if time.time() - path.stat().st_mtime < STALE_S:
@@ -205,7 +207,7 @@ def _sweep(folder: Path) -> None:
 
 
 class _Asked(ThreadAuthenticator):
-    """Knows the address of whoever shows a key, which the callback is not told."""
+    """Stores the network address of the client, since the callback does not get it."""
 
     address = ""
 
@@ -215,7 +217,11 @@ class _Asked(ThreadAuthenticator):
 
 
 class Authenticator:
-    """Encrypts sockets of a context, and turns away those with another key than its file has."""
+    """Encrypts the sockets of a context, and rejects clients whose key is not in the key file.
+
+    Attributes:
+        keys: as last read from their file.
+    """
 
     def __init__(
         self,
@@ -232,36 +238,39 @@ class Authenticator:
         self._thread.configure_curve_callback(domain=DOMAIN, credentials_provider=self)
 
     def guard(self, end: zmq.Socket[bytes]) -> None:
-        """Encrypt a socket that is not bound yet."""
+        """Encrypt a socket; call this before the socket is bound."""
         end.setsockopt(zmq.CURVE_SERVER, 1)
         end.setsockopt(zmq.CURVE_SECRETKEY, self.keys.server.secret.encode())
         end.setsockopt_string(zmq.ZAP_DOMAIN, DOMAIN)
 
     def callback(self, _domain: str, key: bytes) -> bool:
-        """Whether a key (Z85) may connect; called by the thread."""
+        """Whether a public key (Z85) may connect; ZeroMQ's authentication thread calls this."""
         public = key.decode("ascii")
         allowed = public in self._holders
         if not allowed:
             former = self._former.get(public)
-            self._counters.note("refused_keys", "a worker with the key of another run, or a former")
+            self._counters.note("refused_keys", "a worker has a revoked key or one of another run")
             reason = "no key of this run" if former is None else "revoked"
             name, address = "" if former is None else former.name, self._thread.address
             self._audit.note("refused", key=name, public=public, address=address, reason=reason)
         return allowed
 
     def holder(self, public: str) -> Holder:
-        """Who has, or had, a key."""
+        """The holder of a public key, also of a revoked one."""
         return self._holders.get(public) or self._former.get(public) or Holder(revoked=True)
 
     def revoked(self) -> list[Holder]:
-        """Look at the file, once in a second, and return those whose keys are no longer there."""
+        """Read the key file again if it changed, and return the holders of the removed keys.
+
+        The file is checked once in `LOOK_S` at most. If it is invalid, the old keys stay valid.
+        """
         if not self._look.due() or (stamp := self._stamped()) in (None, self._stamp):
             return []
         self._stamp = stamp
         try:
             keys = read_keys(self.keys.path or Path())
         except RunError as error:
-            log.warning("%s; those of before stay valid", error)
+            log.warning("%s; until then the old keys stay valid", error)
             return []
         self.keys, found = keys, holders(keys)
         gone = {key: one for key, one in self._holders.items() if key not in found}
@@ -272,11 +281,11 @@ class Authenticator:
         return list(gone.values())
 
     def close(self) -> None:
-        """End the thread, before the context is destroyed."""
+        """End the thread; call this before the context is destroyed."""
         self._thread.stop()
 
     def _stamped(self) -> tuple[int, int] | None:
-        """What changes with the file; None where there is none."""
+        """Time and number of the key file, to detect changes; None if there is no file."""
         with suppress(OSError):
             found = (self.keys.path or Path()).stat()
             return found.st_mtime_ns, found.st_ino

@@ -1,4 +1,4 @@
-"""The master's two sockets: bounded queues, bounded lingering, and sends that never wait."""
+"""The master's two sockets: queues and closing time are bounded, and sends never wait."""
 
 import math
 from collections.abc import Sequence
@@ -19,23 +19,25 @@ from tangram_core.wire.arrays import MAX_FRAME_BYTES
 from tangram_core.wire.schema import Message
 
 LINGER_MS = 1000
-# Messages queued for each peer and direction; what a peer has no room for it must ask for again.
+# Messages queued for each peer and direction; more are dropped, and the peer must ask again.
 HIGH_WATER = 64
-# A handshake takes milliseconds, seconds on a busy machine.
+# A handshake takes milliseconds, on a busy machine seconds.
 HANDSHAKE_MS = 10_000
-# Connections that wait to be accepted, of many workers that start at once.
+# Connections that wait to be accepted: many workers may start at once.
 BACKLOG = 1024
-# Of a subscription or a step of a handshake; more than encryption adds to a frame.
+# Bytes of a subscription or a step of a handshake; encryption adds less than this to a frame.
 MAX_COMMAND = 1024
-LOOK_S = 1.0  # between two looks at the files of unix sockets
+LOOK_S = 1.0  # between two checks of the files of unix sockets
 
 
 class Received(NamedTuple):
-    """A message, and who it is from.
+    """A received message and its sender.
 
     Attributes:
-        holder: of the key that the connection showed, which may be revoked since.
-        address: of the other side; of a unix socket `local` and the id of its process.
+        identity: ZeroMQ's name of the connection.
+        frames: of the message.
+        holder: holder of the connection's key, which may be revoked by now.
+        address: network address of the sender; for a unix socket, `local` and the process id.
     """
 
     identity: bytes
@@ -45,7 +47,7 @@ class Received(NamedTuple):
 
 
 class Sockets:
-    """A bound ROUTER, and a bound PUB for weights."""
+    """A bound ROUTER socket for all messages, and a bound PUB socket for broadcasts of weights."""
 
     def __init__(
         self,
@@ -75,13 +77,13 @@ class Sockets:
 
     @property
     def keys(self) -> Keys | None:
-        """As their file has them by now; None on plain sockets."""
+        """The keys as last read from their file; None on plain sockets."""
         return None if self._authenticator is None else self._authenticator.keys
 
     def listen_again(self) -> None:
-        """Look, once in a second, whether a cleaner of TMPDIR took the files of unix sockets away.
+        """Bind unix sockets again if a cleaner of TMPDIR deleted their files; check once a second.
 
-        Nobody could join any more. What is connected stays, and so does the socket without a name.
+        Without the files no worker can join. Connections that exist are not affected.
         """
         if not (self.endpoint.startswith(IPC) and self._look.due()):
             return
@@ -93,21 +95,21 @@ class Sockets:
             try:
                 own_folder(path.parent)
                 end.bind(endpoint)
-                done = "it is made anew"
+                done = "it was made again"
             except (RunError, zmq.ZMQError) as error:
-                done = f"nobody can join before it is made anew, which fails ({error})"
+                done = f"it cannot be made again ({error}), and until then no worker can join"
             self._counters.note(
                 "removed_sockets",
-                f"{path} was removed: {done}; keep what cleans {path.parent.parent} away from "
-                f"{path.parent}, or set TMPDIR to another folder",
+                f"{path} was removed: {done}; exclude {path.parent} from the clean-up of "
+                f"{path.parent.parent}, or set TMPDIR to another folder",
             )
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether a message came within this time."""
+        """Wait up to `timeout_s` for a message; returns whether there is one."""
         return bool(self._router.poll(math.ceil(max(0.0, timeout_s) * 1000)))
 
     def receive(self) -> Received | None:
-        """The next message, None if there is none."""
+        """The next message, or None; does not wait."""
         try:
             first = self._router.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
@@ -122,15 +124,15 @@ class Sockets:
         return Received(first.bytes, frames, holder, address)
 
     def revoked(self) -> list[Holder]:
-        """Those whose keys were revoked since; none of them gets weights any more."""
+        """Holders of the keys revoked since the last call; they get no more weights."""
         gone = [] if self._authenticator is None else self._authenticator.revoked()
         if gone and self._gate is not None:
-            # A PUB knows no subscribers: all must show their keys again.
+            # A PUB socket cannot end one subscriber: end all, and check the keys again.
             self._gate.end_all(self.weights_endpoint)
         return gone
 
     def send(self, identity: bytes, frames: Sequence[bytes]) -> None:
-        """Send to a peer; if it is gone or does not read, count that and drop the message."""
+        """Send frames to a peer; if it is gone or does not read, drop the message and count it."""
         try:
             self._router.send_multipart([identity, *frames], zmq.NOBLOCK)
         except zmq.Again:
@@ -145,16 +147,16 @@ class Sockets:
         self.send(identity, answer.encode())
 
     def refuse(self, identity: bytes, counter: str, answer: Message) -> None:
-        """Send a reason, count it and tell it."""
+        """Send a refusal to a peer, count it by name, and log its reason."""
         self._counters.note(counter, getattr(answer, "reason", "a connection without HELLO"))
         self.answer(identity, answer)
 
     def publish(self, frame: bytes) -> None:
-        """Send to all subscribers that have room."""
+        """Send a frame to all subscribers with room in their queue."""
         self._pub.send(frame, zmq.NOBLOCK)
 
     def close(self) -> None:
-        """Close; what is on its way gets a second."""
+        """Close the sockets; queued messages get one second to be sent."""
         self._close(LINGER_MS)
         for endpoint in (self.endpoint, self.weights_endpoint):
             if endpoint.startswith(IPC):
@@ -181,7 +183,7 @@ class Sockets:
             socket.setsockopt(getattr(zmq, name), value)
         socket.setsockopt(zmq.IPV6, int(":" in bind))
         if kind == zmq.ROUTER:
-            # Else answers to those who are gone vanish without a word.
+            # Without this, answers to lost connections are dropped without an error.
             socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
         if self._authenticator is not None:
             self._authenticator.guard(socket)
@@ -197,8 +199,8 @@ class Sockets:
                 ) from None
             if error.errno == zmq.EADDRINUSE:
                 raise ConfigError(
-                    f"port {port} of {bind} is in use: choose another with "
-                    "service.port=..., whose next one is free too, or 0 for any"
+                    f"port {port} of {bind} is in use: set service.port to a number that is free "
+                    "together with the next one, or to 0 for any"
                 ) from None
             raise ConfigError(
                 f"cannot listen on {bind}, port {port} ({error.strerror}): set service.bind to an "
@@ -208,9 +210,9 @@ class Sockets:
 
 
 def _told(frame: zmq.Frame, name: str) -> str:
-    """What ZeroMQ knows of a frame's sender; empty where that is nothing.
+    """A property of a frame's sender; empty if ZeroMQ does not know it.
 
-    Bytes that are no ZeroMQ at all are taken for its first version, which tells nothing.
+    It is unknown if the sender does not speak ZeroMQ, or only the first version of its protocol.
     """
     try:
         return str(frame.get(name))

@@ -1,5 +1,5 @@
-"""Learning and its pace: what is trained, how much, and what becomes of numbers not finite.
+"""Learning: the trainer, its pace, the budget of the run, and the check for finite weights.
 
-Start with `trainer.py`. `rate_limiter.py` and `lockstep.py` keep learning and playing in step. Has
-no sockets. May import master.record.
+Start with `trainer.py`. `rate_limiter.py` and `lockstep.py` balance learning and playing. Has no
+sockets. May import master.record.
 """

@@ -1,4 +1,4 @@
-"""How much of a run's budget is used, and how fast it goes."""
+"""The budget of a run, and rates of progress."""
 
 from collections import deque
 
@@ -11,10 +11,10 @@ HOUR_S = 3600.0
 
 
 class Budget:
-    """The bounds of a run: hours, episodes and updates; the one used most decides.
+    """The bounds of a run: hours, episodes and updates; the run ends at the first one reached.
 
     Attributes:
-        bounded: there is a bound.
+        bounded: whether any bound is set.
     """
 
     def __init__(self, config: MasterConfig, trainer: Trainer, record: Record) -> None:
@@ -26,7 +26,7 @@ class Budget:
 
     @property
     def share(self) -> float:
-        """The largest used share, in [0, 1]; 0 where nothing is bounded."""
+        """The largest used share of a bound, in [0, 1]; 0 if no bound is set."""
         spent = (
             (self._record.loop_s, self.max_seconds),
             (self._trainer.episodes, self.max_episodes),
@@ -35,15 +35,15 @@ class Budget:
         return min(max((used / bound for used, bound in spent if bound), default=0.0), 1.0)
 
     def takes_episodes(self) -> bool:
-        """Whether more episodes may enter the replay."""
+        """Whether max_episodes allows more episodes."""
         return not self.max_episodes or self._trainer.episodes < self.max_episodes
 
     def updates_spent(self) -> bool:
-        """Whether all updates are made."""
+        """Whether max_updates is reached."""
         return bool(self.max_updates) and self._trainer.updates >= self.max_updates
 
     def spent(self) -> str | None:
-        """The bound at which learning stops at once, or None."""
+        """The bound that is reached and ends learning at once, as in `max_updates=9`, or None."""
         if self.updates_spent():
             return f"max_updates={self.max_updates}"
         if self.max_seconds and self._record.loop_s >= self.max_seconds:
@@ -52,7 +52,7 @@ class Budget:
 
 
 class Rates:
-    """Events per second over the last seconds, and the time left."""
+    """Rates over the last `window_s` seconds, and the time left."""
 
     def __init__(self, window_s: float = RATE_WINDOW_S) -> None:
         self.window_s = window_s
@@ -62,7 +62,7 @@ class Rates:
     def mark(
         self, now_s: float, transitions: int, updates: int, share: float, busy_s: float
     ) -> None:
-        """Note the counters at a time of a steady clock, and the processor time until then."""
+        """Note the counters, the monotonic time `now_s` and the processor time `busy_s`."""
         if self._first is None:
             self._first = (now_s, share)
         self._marks.append((now_s, transitions, updates, share, busy_s))
@@ -70,7 +70,7 @@ class Rates:
             self._marks.popleft()
 
     def transitions_per_s(self) -> float:
-        """Transitions that entered the replay, per second."""
+        """Transitions inserted into the replay buffer per second."""
         return self._rate(1)
 
     def updates_per_s(self) -> float:
@@ -78,11 +78,11 @@ class Rates:
         return self._rate(2)
 
     def transitions_per_busy_s(self) -> float:
-        """Transitions per second of the processor: what it would be if nothing were waited for."""
+        """Transitions per second of processor time: the rate if the learner never waited."""
         return self._rate(1, of=4)
 
     def left_s(self) -> float | None:
-        """Seconds until the budget is used, at the pace since the start; None when unknown."""
+        """Seconds until the budget is used, at the mean rate of this process; None if unknown."""
         if self._first is None:
             return None
         now_s, share = self._marks[-1][0], self._marks[-1][3]

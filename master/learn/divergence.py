@@ -1,4 +1,4 @@
-"""Numbers that are not finite: the update is undone, counted, and ends the run if it goes on."""
+"""Protection against divergence: undoes updates that give values that are not finite."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,29 +15,29 @@ from tangram_core.errors import RunError
 from tangram_core.run.process import Every
 from tangram_core.store.files import write_whole
 
-# Going back further costs updates, keeping more often costs time.
+# Time between two copies of the state. Longer: more updates are lost. Shorter: copying costs time.
 KEEP_S = 0.5
 MAX_BAD_UPDATES = 10  # undone in a row, then the run ends
 UNDONE = "undone updates"
 
 
 class DivergenceGuard:
-    """Runs a trainer's updates; one that is not finite takes it back to its last good state.
+    """Runs a trainer's updates; returns to the last good state if values are not finite.
 
     Attributes:
-        trainer: whoever saves its state calls `check` before.
+        trainer: the trainer; call `check` before you save its state.
     """
 
     def __init__(self, trainer: Trainer, evidence: Path, limit: int = MAX_BAD_UPDATES) -> None:
         """Keep the present state as the first good one.
 
         Args:
-            trainer: as made or restored.
-            evidence: where the batch of the last failure is written to when the run ends.
-            limit: failures in a row, without good weights between them, that end it.
+            trainer: new or restored.
+            evidence: file for the batch of the last failure, written when the guard ends the run.
+            limit: the run ends after this many failures in a row.
 
         Raises:
-            NotFiniteError: the state is not finite already.
+            NotFiniteError: the present state is not finite.
         """
         self._tally = Counters()
         self.trainer, self._limit, self._evidence = trainer, limit, evidence
@@ -47,11 +47,11 @@ class DivergenceGuard:
 
     @property
     def undone(self) -> int:
-        """How often something was not finite and the learner went back."""
+        """How many times the learner went back to an earlier state."""
         return self._tally[UNDONE]
 
     def update(self, share: float) -> dict[str, float]:
-        """One update; its losses, none if it was undone; RunError if one too many was."""
+        """Make one update; returns its losses, empty if it was undone; RunError at the limit."""
         try:
             losses = self.trainer.update(share)
         except NotFiniteError as error:
@@ -62,7 +62,7 @@ class DivergenceGuard:
         return losses
 
     def weights(self) -> Weights:
-        """The acting weights, which are finite; RunError if they were not, one time too many."""
+        """The acting weights, always finite: if not, go back first; RunError at the limit."""
         weights = self.trainer.weights()
         try:
             _check_finite(weights.tensors, weights.version)
@@ -72,7 +72,7 @@ class DivergenceGuard:
         return weights
 
     def check(self) -> None:
-        """Keep the state if it is finite, else the one before; RunError where there is none."""
+        """Keep the present state if it is finite, else go back; RunError at the limit."""
         state = self.trainer.learner.state()
         try:
             _check_finite(state, self.trainer.updates)

@@ -1,10 +1,10 @@
-"""Lockstep: everybody waits for everybody, so that the same seed gives the same weights.
+"""Lockstep: learner and players wait for each other, so the same seed gives the same weights.
 
-A run is a row of rounds. In a round each of N players plays one batch with the same weights, and
-episodes whose generators follow from (run, role, index, number) alone; the master inserts the
-batches by index, makes all updates that are due, and sends the weights that the next round is
-played with. Nothing depends on who is fast or when a process was started again, and what was
-inserted says which round it is, so a run that was stopped goes on where it was.
+A run is a sequence of rounds. In a round each of N players plays one batch with the same weights.
+The random generators of an episode depend only on (run, role, index, number). The master inserts
+the batches in the order of the index, makes all updates that are due, and sends the weights for the
+next round. So speed and restarts of processes have no effect on the result. The number of inserted
+episodes determines the round, so a resumed run continues in the right one.
 """
 
 from master.record.delivery import EpisodesArrived
@@ -15,10 +15,10 @@ from tangram_core.wire.messages import Go
 
 
 class Lockstep:
-    """The rounds of a run, in which each of N players, 0 to N - 1, plays `batch_episodes`.
+    """The rounds of a run; in each, every player 0 to N - 1 plays `batch_episodes` episodes.
 
     Attributes:
-        ordered: the players of this round know what to play.
+        ordered: whether the orders of this round were sent.
     """
 
     def __init__(self, players: int, batch_episodes: int) -> None:
@@ -28,10 +28,10 @@ class Lockstep:
 
     @staticmethod
     def of(service: ServiceConfig, workers: int, spec: EpisodeSpec) -> "Lockstep | None":
-        """The lockstep of the settings, None in any other mode.
+        """Create the lockstep of a run; None in any other mode.
 
         Raises:
-            ConfigError: batches that are too large for one message.
+            ConfigError: a batch is too large for one message.
         """
         if service.mode != "lockstep":
             return None
@@ -40,29 +40,29 @@ class Lockstep:
         return Lockstep(workers, size)
 
     def begins_round(self, episodes: int) -> bool:
-        """Whether, with so many episodes inserted, the next one is the first of a round."""
+        """Whether a round begins after `episodes` inserted episodes."""
         return episodes % (self._players * self._size) == 0
 
     def orders(self, version: int, episodes: int) -> dict[int, Go]:
-        """Index -> what to play with the weights of a version, when so many were inserted."""
+        """Index -> order to play with weights `version`, after `episodes` inserted episodes."""
         number, done = divmod(episodes, self._players * self._size)
         first = number * self._size
         missing = range(done // self._size, self._players)
         return {i: Go(number, version, first, self._size) for i in missing}
 
     def take(self, arrival: EpisodesArrived) -> None:
-        """A batch that was ordered has come, in any order of the players."""
+        """Store an ordered batch; the players' batches may arrive in any order."""
         self._arrived[arrival.index] = arrival
 
     def next(self, episodes: int) -> EpisodesArrived | None:
-        """The batch to insert after so many episodes, once all of its round have come."""
+        """The batch to insert after `episodes` episodes; None until the round is complete."""
         index = episodes % (self._players * self._size) // self._size
         if not all(i in self._arrived for i in range(index, self._players)):
             return None
         return self._arrived[index]
 
     def inserted(self, arrival: EpisodesArrived) -> None:
-        """Note that a batch was inserted; with the last one of a round the next round begins."""
+        """Note that a batch was inserted; the last one of a round ends the round."""
         del self._arrived[arrival.index]
         if not self._arrived:
             self.ordered = False

@@ -1,13 +1,13 @@
-"""How learning and playing keep step: updates per transition, both ways."""
+"""The rate limiter: keeps the ratio of updates to transitions, for learner and players."""
 
 import math
 from collections.abc import Mapping
 
 from tangram_core.errors import ConfigError, RunError
 
-# Updates that the learner may lag behind before workers must wait: some seconds of learning.
+# Workers must wait if the learner lags by this many updates, which is some seconds of learning.
 LAG_UPDATES = 64
-# Sums such as 0.29 * 100 end just below the integer that is meant.
+# Products such as 0.29 * 100 are slightly below the exact integer.
 ROUNDING = 1e-6
 
 
@@ -22,14 +22,14 @@ class RateLimiter:
         may_update = lag >= 1          the learner never runs ahead of u updates per transition
         may_insert = lag < L           players wait while the learner is L or more updates behind
 
-    Boundary cases: nothing is due before s transitions; with the s-th all u s of them are. A batch
-    is inserted whole, so the lag may pass L by what one batch is worth, u times its transitions.
+    Boundary cases: no update is due before s transitions; with transition s, u s updates are due. A
+    batch is inserted as a whole, so the lag may exceed L by u times the transitions of one batch.
 
-    It cannot deadlock: who may not insert lags by L >= 1 updates and so may update. With L < 1
-    nobody could ever insert, so that is refused.
+    There is no deadlock: if no insert is allowed, the lag is at least L >= 1, so an update is
+    allowed. With L < 1 no insert would ever be allowed, so such an L is refused.
 
-    After a restore u, s and L come from the settings, n, m and what was due come from the
-    checkpoint: another u holds for transitions from then on and neither forgives nor adds debt.
+    After a restore, u, s and L come from the settings; n, m and due(n) come from the checkpoint. A
+    changed u applies to later transitions only; due(n) up to then stays as it was.
 
     Attributes:
         transitions: n.
@@ -42,12 +42,12 @@ class RateLimiter:
         if not (math.isfinite(updates_per_transition) and updates_per_transition > 0):
             raise ConfigError(
                 "agent.updates_per_transition must be positive and finite, got "
-                f"{updates_per_transition}: nothing would ever be learned"
+                f"{updates_per_transition}: no update would ever be made"
             )
         if lag_updates < 1:
             raise ConfigError(
-                f"the lag must be at least 1 update, got {lag_updates}: no transition could "
-                "ever be inserted, so learner and workers would wait for each other for ever"
+                f"the lag must be at least 1 update, got {lag_updates}: with less, no transition "
+                "could be inserted, so learner and workers would wait for each other for ever"
             )
         self._rate, self._starts, self._limit = updates_per_transition, learning_starts, lag_updates
         self.transitions = 0
@@ -67,15 +67,15 @@ class RateLimiter:
         return self.lag >= 1
 
     def may_insert(self) -> bool:
-        """Whether the learner keeps up well enough for another batch."""
+        """Whether another batch may be inserted: the lag must be below the limit."""
         return self.lag < self._limit
 
     def inserted(self, transitions: int) -> None:
-        """Count transitions that went into the replay; relabelled ones do not count."""
+        """Count transitions inserted into the replay buffer; relabelled ones do not count."""
         self.transitions += transitions
 
     def updated(self, count: int = 1) -> None:
-        """Count updates that were done; a negative count takes back updates that were undone."""
+        """Count updates; a negative count is for updates that were undone."""
         self.updates += count
 
     def state(self) -> dict[str, float]:
@@ -83,7 +83,7 @@ class RateLimiter:
         return {"transitions": self.transitions, "updates": self.updates, "due": self._due()}
 
     def load_state(self, state: Mapping[str, float]) -> None:
-        """Take the counters of a checkpoint; RunError if one is missing or negative."""
+        """Load the counters of a checkpoint; RunError if one is missing, negative or not finite."""
         values = [state.get(name, -1.0) for name in ("transitions", "updates", "due")]
         if not all(math.isfinite(value) and value >= 0 for value in values):
             raise RunError(

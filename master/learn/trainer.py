@@ -1,4 +1,4 @@
-"""What learns, without sockets: the agent's learner, the rate limiter, and their state."""
+"""The trainer: the agent's learner, the rate limiter, and their state; without sockets."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,18 +15,22 @@ from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_core.store.checkpoints import ACTING, SETUP
 
-COMPILED = "compiled"  # of a checkpoint's values: how its updates were made
-LEARNER, REPLAY = "learner", "replay"  # the checkpoint's files: networks and optimisers; experience
+COMPILED = "compiled"  # name of a checkpoint's value: whether its updates were compiled
+LEARNER, REPLAY = "learner", "replay"  # files of a checkpoint: networks and optimisers; transitions
 
 Arrays = dict[str, dict[str, npt.NDArray[Any]]]
 
 
 class Trainer:
-    """The learner and everything that its next update depends on.
+    """The learner with its rate limiter, its random generators and its counters.
 
     Attributes:
-        compiled: whether updates are compiled; a run stays with what it began with.
-        episodes: taken in since the run began.
+        setup: the task and the agent.
+        compiled: whether updates are compiled; this cannot change during a run.
+        learner: the agent's learner.
+        pace: how many updates a transition is worth, and when learning starts.
+        rate_limiter: tells when an update is due.
+        episodes: number inserted since the run began.
     """
 
     def __init__(
@@ -51,46 +55,46 @@ class Trainer:
 
     @property
     def updates(self) -> int:
-        """Updates since the run began."""
+        """Number of updates since the run began."""
         return self.learner.updates
 
     @property
     def transitions(self) -> int:
-        """Transitions played that were taken in, without relabelled ones."""
+        """Number of inserted transitions as they were played, without relabelled ones."""
         return self.episodes * self.setup.spec.horizon
 
     def facts(self) -> dict[str, Any]:
-        """What a result tells of the task and the agent."""
+        """Facts about the task and the agent for result.json, by name."""
         learner = self.learner
         own = {"device": learner.device, "parameters": learner.parameters}
         return {**self.setup.agent.facts(), **self.setup.task.facts(), **own}
 
     def insert(self, episodes: Episodes) -> None:
-        """Take in episodes as they were played."""
-        # The pace is that of what can be learned from.
+        """Insert episodes into the replay buffer."""
+        # The learner says how many transitions it can learn from; only these make updates due.
         self.rate_limiter.inserted(self.learner.insert(episodes, self._generators))
         self.episodes += episodes.count
 
     def update(self, share: float) -> dict[str, float]:
-        """One update, at the used share of the budget; returns its losses."""
+        """Make one update, at this used share of the budget in [0, 1]; returns losses by name."""
         losses = self.learner.update(share, self._generators)
         self.rate_limiter.updated()
         return losses
 
     def go_back(self, state: dict[str, npt.NDArray[Any]]) -> None:
-        """Take the learner back to a state of its own; the updates since are due again."""
+        """Restore an earlier state of the learner; the updates since then are due again."""
         before = self.updates
         self.learner.load_state(state)
         self.rate_limiter.updated(self.updates - before)
 
     def weights(self) -> Weights:
-        """What workers need to play; its version is the number of updates."""
+        """The weights that workers need to play; the version is the number of updates."""
         return Weights(self.updates, self.learner.broadcast())
 
     def state(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays by file, and JSON values, for a checkpoint.
 
-        The caller sees to it that they are finite, see `divergence`.
+        The caller makes sure that the arrays are finite, see `divergence`.
         """
         learner = self.learner
         arrays = {ACTING: learner.export(), LEARNER: learner.state(), REPLAY: learner.memory()}
@@ -105,18 +109,17 @@ class Trainer:
         return arrays, counters
 
     def load_state(self, arrays: Mapping[str, Any], counters: Mapping[str, Any]) -> None:
-        """Take over a state from `state()`; settings stay those of this process.
+        """Restore what `state` returned; the settings stay those of this process.
 
         Raises:
-            RunError: the state belongs to another task or network, or its updates were compiled and
-                these are not, or the reverse.
+            RunError: the state belongs to another task or network, or `compiled` differs.
         """
         check_same_task(self.setup, counters[SETUP])
         before = bool(counters.get(COMPILED, False))
         if before != self.compiled:
             raise RunError(
-                f"the run learned with service.compile={str(before).lower()} so far, and its "
-                "numbers would not be the same otherwise: go on with that"
+                f"the run began with service.compile={str(before).lower()}, and the other value "
+                "would change its numbers: go on with that setting"
             )
         self.learner.load_state(arrays[LEARNER])
         self.learner.load_memory(arrays[REPLAY])
@@ -127,7 +130,11 @@ class Trainer:
 
 
 def choose_device(wanted: str) -> str:
-    """`auto` is a GPU where there is one; ConfigError where one is wanted and there is none."""
+    """The device, `cpu` or `cuda`; `auto` takes a GPU if there is one.
+
+    Raises:
+        ConfigError: `cuda` is wanted, and there is no GPU.
+    """
     if wanted == "cpu":
         return "cpu"
     if torch.cuda.is_available():

@@ -1,6 +1,6 @@
-"""What a run keeps: its folder, the journal, what of it is there after a kill, and who did what.
+"""The records of a run: run folder, journal and its recovery, locks, audit log and counters.
 
 Start with `delivery.py` (which batches are new), then `journal.py` and `recovery.py`. `rundir.py`
-is the folder and who may write there. `audit.py` and `counters.py` keep what went on. Imports no
-other folder of master.
+has the run folder and its lock. `audit.py` and `counters.py` record events. Imports no other folder
+of master.
 """

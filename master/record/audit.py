@@ -1,4 +1,4 @@
-"""Who joined, left and was refused: one JSON object a line, in a file that stays bounded."""
+"""The audit log: who joined, left or was refused, as JSON lines in a file of bounded size."""
 
 import json
 import logging
@@ -9,7 +9,7 @@ from typing import Any
 from tangram_core.errors import TangramError
 from tangram_core.store.files import private
 
-# Lines of one event: so many at once, then one in so many seconds. The rest is counted.
+# Lines of one event: BURST at once, then one in REFILL_S seconds. Lines left out are counted.
 BURST, REFILL_S = {"refused": 256}, {"refused": 60.0}
 MOST_AT_ONCE, EVERY_S = 8192, 1.0
 MAX_BYTES = 8 * 2**20  # then the file becomes NAME.old, in place of the one before
@@ -19,9 +19,9 @@ log = logging.getLogger(__name__)
 
 
 class Audit:
-    """The log of a run, or none.
+    """The audit log of a run; without a path it writes nothing.
 
-    What the disk does not take is left out, and told: it is not worth a run.
+    If the disk fails, lines are missing and a warning is logged, but the run goes on.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -30,7 +30,7 @@ class Audit:
         self._left_out: dict[str, int] = {}
 
     def note(self, event: str, **fields: Any) -> None:
-        """Write one line, unless there were too many of this event."""
+        """Write one line, unless there were too many lines of this event."""
         if self._path is None:
             return
         if not self._may(event):
@@ -56,14 +56,14 @@ class Audit:
 
 
 def write_line(path: Path, event: str, **fields: Any) -> None:
-    """Add a line to the log of a run; TangramError if the disk does not take it."""
+    """Append a line to the audit log of a run; TangramError if the disk cannot be written."""
     texts = {n: v[:MAX_TEXT] if isinstance(v, str) else v for n, v in fields.items()}
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     line = json.dumps({"time": now, "event": event, **texts})
     try:
         if path.exists() and path.stat().st_size > MAX_BYTES:
             path.replace(path.with_name(f"{path.name}.old"))
-        # Whoever knows the id of a process could name it.
+        # Private, because another user could misuse the process ids in the file.
         with open(path, "a", encoding="utf-8", opener=private) as file:
             file.write(line + "\n")
     except OSError as error:

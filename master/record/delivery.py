@@ -1,13 +1,13 @@
-"""Delivery: what arrives, which batches of one incarnation were seen, what to do with the next.
+"""Delivery of batches: which ones are new, duplicates or missing, for exactly-once inserts.
 
-A worker numbers its batches from 1 within an incarnation, sends them in order, and again until they
-are acknowledged. So one integer tells old from new, and with the incarnation it is all that a
-checkpoint must keep for exactly-once inserts.
+A worker numbers its batches from 1 within an incarnation. It sends them in order, and repeats them
+until they are acknowledged. So one integer separates old batches from new ones. For exactly-once
+inserts, a checkpoint must keep only this integer and the incarnation.
 
-A batch is done with in one of two ways. It was inserted, and is acknowledged. Or it came intact and
-its content is wrong: it is consumed, and refused for good, for it would be as wrong when it came
-again, and a broken worker must not send it for ever. A message that was damaged on its way is
-neither: nothing in it is believed, its number least of all, and what was meant comes again.
+A batch is finished in one of two ways. Either it was inserted and is acknowledged. Or it arrived
+intact with wrong content: then it is consumed and refused for good, because a second copy would be
+just as wrong. A message that was damaged on its way is not finished. Nothing in it is trusted, not
+even its number, and the worker sends the batch again.
 """
 
 import math
@@ -20,16 +20,20 @@ from tangram_core.spec import Episodes
 from tangram_core.wire.messages import Ack, EpisodeBatch, Reject, Scores
 
 REMEMBERED_VERSIONS = 4096
-# Of one key: peers that have left and whose batches still wait, and bytes of all that wait.
+# Limits of one key: peers that have left but whose batches wait, and bytes of all waiting batches.
 SPARE_PEERS, MAX_BYTES = 64, 512 * 2**20
-MAX_EVALUATORS = 16  # that score the same weights
+MAX_EVALUATORS = 16  # that may score the same weights
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodesArrived:
-    """A new batch of a sender that waits for its insert; its arrays are read-only.
+    """A new batch that waits for its insert; its arrays are read-only.
 
-    The frames are as they came, for the journal.
+    Attributes:
+        role, index, incarnation, process: of the sender.
+        batch: the decoded message.
+        frames: the message as it arrived, for the journal.
+        owner: name of the sender's key; empty if the run has no keys.
     """
 
     role: str
@@ -47,18 +51,18 @@ class EpisodesArrived:
 
     @property
     def weights_version(self) -> int:
-        """Of the weights that played it."""
+        """Version of the weights that played the batch."""
         return self.batch.weights_version
 
     @property
     def episodes(self) -> Episodes:
-        """What was played."""
+        """The episodes of the batch."""
         return self.batch.episodes
 
 
 @dataclass(frozen=True, eq=False)
 class ScoresArrived:
-    """Results of an evaluator."""
+    """New scores from an evaluator."""
 
     index: int
     incarnation: int
@@ -69,10 +73,10 @@ Arrival = EpisodesArrived | ScoresArrived
 
 
 class Verdict(Enum):
-    """What to do with a batch; the values name the counters.
+    """State of a batch that arrives; the values are names of counters.
 
-    NEW: insert it. HELD: it came before and is not inserted yet. INSERTED: it was inserted before.
-    GAP: one before it is missing. EXCESS: too many are unacknowledged.
+    NEW: insert it. HELD: a duplicate of a batch that waits for its insert. INSERTED: a duplicate of
+    an inserted batch. GAP: the batch before it is missing. EXCESS: too many are unacknowledged.
     """
 
     NEW = "new"
@@ -84,16 +88,16 @@ class Verdict(Enum):
 
 @dataclass(eq=False)
 class Ledger:
-    """Batches of one incarnation; it outlives connections.
+    """The batches of one incarnation; kept when the connection is lost.
 
     Attributes:
-        incarnation: whose batches these are.
-        received: number of the last batch that was taken or finally refused.
-        process: random id of the process, empty where it is not known. Two may name one
-            incarnation: what was given before a kill and had no batch is given again after it.
-        owner: name of the key that opened it, and whose it stays; empty where there are none.
-        held: taken, not inserted yet.
-        unused: no batch of this index was ever taken, in this incarnation or before.
+        incarnation: number of the incarnation.
+        received: number of the last batch that was accepted or refused for good.
+        process: random id of the process; empty if unknown. Two processes may claim one
+            incarnation: after a kill, a number without any batch may be given again.
+        owner: name of the key that had the index first; empty if the run has no keys.
+        held: numbers of the batches that were accepted and are not inserted yet.
+        unused: whether no batch of this index was ever accepted, in any incarnation.
     """
 
     incarnation: int
@@ -104,16 +108,16 @@ class Ledger:
     unused: bool = False
 
     def is_of(self, owner: str) -> bool:
-        """Whether it is a key's own, or there are no keys."""
+        """Whether the ledger belongs to this key, or to no key."""
         return not self.owner or owner in ("", self.owner)
 
     @property
     def inserted(self) -> int:
-        """Number of the last batch up to which nothing is held."""
+        """Number of the last batch that is finished together with all before it."""
         return min(self.held, default=self.received + 1) - 1
 
     def judge(self, sequence: int, window: int) -> Verdict:
-        """What to do with a batch of this number, when at most `window` may be held."""
+        """State of a batch with this number if at most `window` batches may be held."""
         if sequence <= self.received:
             return Verdict.HELD if sequence in self.held else Verdict.INSERTED
         if sequence > self.received + 1:
@@ -121,19 +125,19 @@ class Ledger:
         return Verdict.EXCESS if len(self.held) >= window else Verdict.NEW
 
     def answer(self, verdict: Verdict, sequence: int) -> Ack | Reject | None:
-        """What the worker is told of a batch that is not inserted now."""
+        """Answer to the worker for a batch that is not new; None if the answer comes later."""
         if verdict is Verdict.INSERTED:
             return Ack(sequence, duplicate=True)
         if verdict is Verdict.GAP:
             why = f"batch {self.received + 1} must come first"
         elif verdict is Verdict.EXCESS:
-            why = f"{len(self.held)} batches are unacknowledged, the most there may be"
+            why = f"{len(self.held)} batches are unacknowledged, which is the limit"
         else:
-            return None  # acknowledged after its insert
+            return None  # the batch is acknowledged after its insert
         return Reject(reason=f"batch {sequence}: {why}", sequence=sequence, final=False)
 
     def take(self, sequence: int, window: int) -> Verdict:
-        """What to do with a batch of this number; the next one is held until its insert."""
+        """As `judge`; a new batch is then held until `release`."""
         verdict = self.judge(sequence, window)
         if verdict is Verdict.NEW:
             self.consume(sequence)
@@ -141,44 +145,44 @@ class Ledger:
         return verdict
 
     def release(self, sequence: int) -> bool:
-        """A batch that was taken is inserted now; False if it was not held."""
+        """Note that a held batch was inserted; False if it was not held."""
         held = sequence in self.held
         self.held.discard(sequence)
         return held
 
     def consume(self, sequence: int) -> None:
-        """The next batch is refused for good: it counts as done, without an insert."""
+        """Count the next batch as received without an insert, as when it is refused for good."""
         self.received, self.unused = sequence, False
 
     def skip_to(self, sequence: int) -> int:
-        """Go on at this number; returns how many batches before it were never received."""
+        """Expect this number next; returns how many batches before it were never received."""
         missing = max(0, sequence - 1 - self.received)
         self.received += missing
         return missing
 
 
 class Waiting:
-    """Batches that wait for their insert, of all processes that have an index one after another.
+    """Counts the batches that wait for their insert, and limits them.
 
-    At most a window of one index, and `MAX_BYTES` of one key.
+    The limits are a window for each index, whatever process has it, and `MAX_BYTES` for each key.
     """
 
     def __init__(self, window: int, lockstep: bool = False) -> None:
-        """Nothing waits. In lockstep a whole round must fit, which orders bound."""
+        """Begin with none. In lockstep bytes have no limit: the orders limit the batches."""
         self._window, self._of = window, Counter[tuple[str, int]]()
         self._most_bytes = math.inf if lockstep else MAX_BYTES
         self._batches, self._bytes = Counter[str](), Counter[str]()  # of a key
 
     def add(self, arrival: EpisodesArrived) -> None:
-        """One more."""
+        """Count a batch that waits."""
         self._count(arrival, 1)
 
     def done(self, arrival: EpisodesArrived) -> None:
-        """One less."""
+        """Remove a batch that was inserted."""
         self._count(arrival, -1)
 
     def room(self, key: tuple[str, int], ledger: Ledger, peers: int) -> int:
-        """How many of a process may be held, while so many peers take part."""
+        """How many batches a process may hold, while `peers` processes take part."""
         crowd = self._batches[ledger.owner] >= self._window * (peers + SPARE_PEERS)
         if crowd or self._bytes[ledger.owner] >= self._most_bytes:
             return 0
@@ -190,29 +194,31 @@ class Waiting:
         self._bytes[owner] += sign * sum(map(len, arrival.frames))
         self._of[key] += sign
         if not self._of[key]:
-            del self._of[key]  # indices come and go
+            del self._of[key]  # so that the table does not grow for ever
 
 
 class Exams:
-    """Which weights were published in this life of the master, and who has scored them."""
+    """The versions of weights that this master process published, and who has scored them."""
 
     def __init__(self) -> None:
         self._scored = OrderedDict[int, set[int]]()  # version -> indices
 
     def published(self, version: int) -> None:
-        """From now on these may be scored, once by each evaluator."""
+        """Allow each evaluator to score this version once."""
         self._scored.setdefault(version, set())
         while len(self._scored) > REMEMBERED_VERSIONS:
             self._scored.popitem(last=False)
 
     def take(self, version: int, index: int) -> str:
-        """Note that an evaluator scored these weights; why that is too much, or empty."""
+        """Note that an evaluator scored a version; returns a reason to refuse that, or empty."""
         scored = self._scored.get(version)
         if scored is None:
-            return f"weights {version} are none of the last {REMEMBERED_VERSIONS:,} of this master"
+            return (
+                f"weights {version} are not among the last {REMEMBERED_VERSIONS:,} of this master"
+            )
         if index in scored:
             return f"it has scored weights {version} before"
         if len(scored) >= MAX_EVALUATORS:
-            return f"{MAX_EVALUATORS} evaluators have scored weights {version}, the most that may"
+            return f"{MAX_EVALUATORS} evaluators have scored weights {version}, which is the limit"
         scored.add(index)
         return ""

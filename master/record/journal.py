@@ -1,21 +1,21 @@
-"""The journal: every batch is on disk before it is acknowledged, so that a kill loses none.
+"""The journal: every batch is written before it is acknowledged, so that a kill loses none.
 
-A folder of segments, `00000001.log` and on. A checkpoint begins the next one, and names it as the
-first that it does not cover; a life of the master that goes on appends to the newest. See
-`recovery` for how they are read.
+The journal is a folder of segments, `00000001.log` and so on. Each checkpoint starts a new segment,
+and stores its number as the first segment that the checkpoint does not cover. A resumed master
+appends to the newest segment. `recovery` reads the segments.
 
-A segment is a row of records, each a head and a body. The head: a magic, the length of the body,
-the number of the record, and a CRC-32 each of the body and of the head itself. Batches are numbered
-from 1 on, over all segments and lives of a run; a title carries the number of the batch before it.
-The head stays as it is in later formats.
+A segment is a sequence of records. A record is a head and a body. The head: a magic number, the
+length of the body, the number of the record, a CRC-32 of the body and a CRC-32 of the head itself.
+Batches are numbered from 1 over all segments and processes of a run. A title has the number of the
+batch before it. Later formats must not change the head.
 
-The body: a header behind its length (u16), declared and read like those of messages. The header of
-a title says which run and task what follows is of; each life begins with one, and each segment.
-That of a batch says who sent the batch whose frames follow, joined, just as they came: with their
-own checksum, which is checked again when they are read.
+The body: the length of a header (u16), the header, and for a batch its frames. Headers are declared
+and read like those of messages. A title names the run and the task of the batches after it; each
+segment and each master process begins with one. The header of a batch names its sender. The frames
+follow as they arrived, with their own checksum, which is checked again when they are read.
 
-A record goes to the operating system at once, so that it outlives the process; it is synced to the
-disk at an interval, so a machine that loses power may lose what came since.
+A record goes to the operating system at once, so it survives the end of the process. It is synced
+to the disk at intervals, so a power cut may lose the newest records.
 """
 
 import logging
@@ -39,7 +39,7 @@ from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
 from tangram_core.wire.schema import MAX_COUNT, Message
 
-FORMAT = 5  # 4 had no owners
+FORMAT = 5  # format 4 had no owners
 SUFFIX = ".log"
 DIGITS = 8
 MAGIC = b"\xf1TJ\n"
@@ -50,11 +50,11 @@ CRC = struct.Struct("<I")
 
 @dataclass(frozen=True)
 class Place:
-    """Where a checkpoint stands in the journal.
+    """Position of a checkpoint in the journal.
 
     Attributes:
-        segment: the first one that it does not cover.
-        number: of the last batch before that.
+        segment: number of the first segment that the checkpoint does not cover.
+        number: number of the last batch before that segment.
     """
 
     segment: Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNT)] = 1
@@ -63,7 +63,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Title(Message):
-    """What a segment is of; the task is a digest of what the arrays belong to."""
+    """Header of a title: format, run, and task as a digest of the settings without the agent's."""
 
     kind: ClassVar[str] = "segment"
     format: Count
@@ -73,7 +73,7 @@ class Title(Message):
 
 @dataclass(frozen=True)
 class Entry(Message):
-    """Who sent the batch that follows."""
+    """Header of a batch: its sender."""
 
     kind: ClassVar[str] = "batch"
     role: Role
@@ -87,32 +87,32 @@ log = logging.getLogger(__name__)
 
 
 class JournalError(RunError):
-    """The journal cannot be written: nothing may be acknowledged until it can."""
+    """The journal cannot be written; until it can, no batch may be acknowledged."""
 
 
 class Journal:
     """Appends batches to the journal.
 
     Attributes:
-        segment: number of the segment that the next batch goes to.
-        number: of the last batch.
-        exposed: what it took since the last checkpoint may be gone: the next one is due at once.
+        segment: number of the segment for the next batch.
+        number: number of the last batch.
+        exposed: whether batches since the last checkpoint may be lost, so that a checkpoint is due.
     """
 
     def __init__(
         self, folder: Path, run_id: str, task: str, sync_s: float, after: Place | None = None
     ) -> None:
-        """Nothing is written before the first batch, unless a life before this one has.
+        """Open the newest segment, if there is one; a new segment is made with the first batch.
 
         Args:
-            folder: of the segments, made if it is missing; what it is in must be there.
+            folder: of the segments, made if it is missing; its parent folder must exist.
             run_id: of the run.
-            task: digest of what the arrays belong to.
+            task: digest of the settings without the agent's.
             sync_s: seconds between two syncs, 0 to sync each batch.
-            after: segment that a checkpoint names, and the number of the last batch.
+            after: segment of the checkpoint, and number of the last batch; None for a new run.
 
         Raises:
-            JournalError: the segment cannot be gone on with.
+            JournalError: the segment cannot be opened or written.
         """
         self._folder, self._title = folder, Title(FORMAT, run_id, task)
         self._file: FileIO | None = None
@@ -127,11 +127,11 @@ class Journal:
             self._begin()
 
     def append(self, arrival: EpisodesArrived) -> None:
-        """Hand a batch to the operating system.
+        """Append a batch to the open segment, and sync if a sync is due.
 
         Raises:
-            JournalError: the disk is full or broken. What was written of it is taken back; where
-                it may have been written after all, a restart drops what it has twice.
+            JournalError: the disk is full or broken. A part that was written is removed. If the
+                batch is on the disk nevertheless, a restart drops the duplicate.
         """
         who = (arrival.role, arrival.index, arrival.incarnation)
         entry = Entry(*who, arrival.process, arrival.owner)
@@ -142,16 +142,16 @@ class Journal:
         self.tick()
 
     def tick(self) -> None:
-        """Sync when it is time; JournalError as in `sync`."""
+        """Sync if a sync is due; JournalError as in `sync`."""
         if self._dirty and self._sync.due():
             self.sync()
 
     def sync(self) -> None:
-        """Wait until the disk has it all.
+        """Wait until all records are on the disk.
 
         Raises:
-            JournalError: it does not take it. Nobody knows what it has then, and syncing again
-                would not tell: what follows goes to a new segment.
+            JournalError: the sync failed. It is unknown which records are on the disk, and a
+                second sync would not show it, so the next batches go to a new segment.
         """
         if self._file is not None and self._dirty:
             try:
@@ -162,18 +162,22 @@ class Journal:
             self._dirty = False
 
     def in_place(self) -> bool:
-        """Whether the open segment still is what lies under its name."""
+        """Whether the open segment is still the file with its name; True if none is open."""
         path = segment_path(self._folder, self.segment)
         return self._file is None or is_same(self._file.fileno(), path)
 
     def abandon(self) -> None:
-        """Leave the open segment: what it holds may be gone."""
+        """Close the open segment without a sync, and mark its batches as possibly lost."""
         self._drop()
         self.segment += 1
         self.exposed = True
 
     def rotate(self) -> Place:
-        """Begin a new segment, unless this one is new; JournalError as in `append`."""
+        """Begin a new segment unless the present one is empty; JournalError as in `append`.
+
+        Returns:
+            The position after the last batch.
+        """
         if self._file is not None and not self._bare:
             self.close()
             self.segment += 1
@@ -182,7 +186,7 @@ class Journal:
         return Place(self.segment, self.number)
 
     def drop_before(self, segment: int) -> None:
-        """Delete the segments below a number, which checkpoints cover; it is told if that fails."""
+        """Delete the segments before a number, never the open one; log a warning if that fails."""
         for number, path in segments(self._folder).items():
             try:
                 if number < min(segment, self.segment):
@@ -198,17 +202,17 @@ class Journal:
             self._file = None
 
     def _begin(self) -> FileIO:
-        """Open the segment, and write its title for good: a checkpoint may name it."""
+        """Open the segment, and write and sync its title: a checkpoint may refer to it."""
         try:
             make_folders(self._folder, above=False)
-            # What lies there is kept: of a life before, or of a title without room.
+            # Append: an earlier process may have left records, or a part of a title.
             file = FileIO(segment_path(self._folder, self.segment), "a")
             self._good = os.fstat(file.fileno()).st_size
         except OSError as error:
             raise self._broken(error) from None
         self._file, self._bare = file, self._good == 0
         try:
-            # Bytes that are synced into a file without a name would be lost with the power.
+            # If the folder is not synced, a power cut can lose the name of the file.
             sync_folder(self._folder)
             self._write(file, _record(self._title, self.number, []))
             os.fsync(file.fileno())
@@ -221,10 +225,10 @@ class Journal:
         return file
 
     def _write(self, file: FileIO, record: bytes) -> None:
-        """Append a record; JournalError if it does not fit, and what was written is taken back."""
+        """Append a record; on JournalError, the part that was written is removed."""
         left = memoryview(record)
         try:
-            while left:  # a disk that is nearly full takes a part of it
+            while left:  # if the disk is nearly full, a write may be partial
                 left = left[file.write(left) or 0 :]
         except OSError as error:
             self._take_back(file)
@@ -232,7 +236,7 @@ class Journal:
         self._good += len(record)
 
     def _take_back(self, file: FileIO) -> None:
-        """Cut off what was written in part; where that fails, too, go on in a new file."""
+        """Cut off a partial record; if that fails, too, use a new segment."""
         try:
             os.ftruncate(file.fileno(), self._good)
         except OSError:
@@ -251,13 +255,13 @@ class Journal:
 
 
 def segments(folder: Path) -> dict[int, Path]:
-    """Number -> path of the segments, in order."""
+    """Number -> path of each segment, in order of the numbers."""
     paths = folder.glob(f"*{SUFFIX}") if folder.is_dir() else ()
     return dict(sorted((int(path.stem), path) for path in paths if path.stem.isdecimal()))
 
 
 def segment_path(folder: Path, number: int) -> Path:
-    """Where a segment lies."""
+    """The path of a segment."""
     return folder / f"{number:0{DIGITS}d}{SUFFIX}"
 
 

@@ -1,7 +1,7 @@
-"""A second guard of a run folder, for file systems on which a lock holds on one machine alone.
+"""A lease on a run folder, for network file systems where `flock` works on one machine only.
 
-Whoever works in the folder keeps a file there with its name in it, and touches it every few
-seconds. Times are the file system's, so that clocks may differ.
+The process that uses the folder keeps a file there with its host name and id, and touches the file
+every few seconds. All times come from the file system, so the clocks of machines may differ.
 """
 
 import json
@@ -17,27 +17,27 @@ from tangram_core.errors import TangramError, UnavailableError
 from tangram_core.run.process import Every, still_alive, watching
 
 RENEW_S = 10.0
-STALE_S = 60.0  # after which one that is not renewed is nobody's
+STALE_S = 60.0  # a lease that was not renewed for this time may be taken over
 LOOK_S = 1.0
 
 log = logging.getLogger(__name__)
 
 
 class LostError(TangramError):
-    """Another machine has taken the folder over."""
+    """A process on another machine has taken the folder over."""
 
 
 class Lease:
-    """The file of one process, which holds the lock of the same folder on its machine."""
+    """The lease of one process, which must hold the lock (`flock`) of the folder, too."""
 
     def __init__(self, path: Path) -> None:
-        """Take it, from a process of another machine only after it was silent for long.
+        """Take the lease; wait up to `STALE_S` if a process on another machine seems to have it.
 
-        A disk that does not take it is told of, and no reason to stop.
+        If the file cannot be written, a warning is logged and the process goes on without a lease.
 
         Raises:
-            UnavailableError: a process of another machine works there, perhaps of a job that was
-                queued again before this one had ended.
+            UnavailableError: a process on another machine uses the folder. It may belong to a job
+                that was requeued before it had ended.
         """
         self._path, self._host, self._id = path, socket.gethostname(), secrets.token_hex(8)
         self._aside = path.with_name(f"{path.name}.{self._id}")
@@ -49,13 +49,13 @@ class Lease:
         except OSError as error:
             why = error.strerror
             log.warning("%s cannot be written (%s): other machines are not seen", path, why)
-        watching.append(self._keep)  # a checkpoint may take longer than others wait
+        watching.append(self._keep)  # writing a checkpoint may take longer than STALE_S
 
     def renew(self) -> None:
-        """Say that its process lives, where it is time.
+        """Touch the file if that is due.
 
         Raises:
-            LostError: another machine has the folder now, for good.
+            LostError: another machine has the folder now; each later call raises this again.
         """
         if not self._lost and self._due.due():
             with suppress(OSError):
@@ -64,20 +64,20 @@ class Lease:
             raise LostError(f"a process on {self._lost} has taken it over")
 
     def close(self) -> None:
-        """Leave the folder to others, if it is this one's still."""
+        """Delete the file if this process still has the lease."""
         watching.remove(self._keep)
         with suppress(OSError):
             if self._holder()[1] == self._id:
                 self._path.unlink()
 
     def _keep(self) -> None:
-        with suppress(LostError):  # told when it is asked next
+        with suppress(LostError):  # the next call of `renew` raises it again
             self.renew()
 
     def _renew(self) -> None:
         try:
             host, holder = self._holder()
-        except FileNotFoundError:  # somebody tidied up
+        except FileNotFoundError:  # somebody deleted the file
             self._made()
             return
         if holder == self._id:
@@ -86,10 +86,10 @@ class Lease:
             self._lost = host
 
     def _made(self) -> bool:
-        """Whether there was none, and there is one now."""
+        """Make the file; False if another process has one."""
         try:
             self._aside.write_text(json.dumps({"host": self._host, "id": self._id}))
-            os.link(self._aside, self._path)  # whole, or not at all
+            os.link(self._aside, self._path)  # atomic: no other process sees a partial file
         except FileExistsError:
             return False
         finally:
@@ -97,11 +97,14 @@ class Lease:
         return True
 
     def _await_silence(self) -> os.stat_result:
-        """Whose it is when its process is gone, as the lock tells of one of this machine."""
+        """Wait until the holder's file is stale, and return the file's status.
+
+        No wait for a holder on this machine: the lock shows that its process has ended.
+        """
         host, first = self._holder()[0], _fresh(self._path)
         until_s = time.monotonic() + STALE_S - (self._now_s() - first.st_mtime)
         if host != self._host and time.monotonic() < until_s:
-            log.warning("waits whether a process on %s works in %s", host, self._path.parent)
+            log.warning("waiting to see if a process on %s uses %s", host, self._path.parent)
         while host != self._host and time.monotonic() < until_s:
             time.sleep(LOOK_S)
             still_alive()
@@ -113,7 +116,7 @@ class Lease:
         return first
 
     def _take_away(self, old: os.stat_result) -> None:
-        """Put it out of the way, unless another process did, and has its own there by now."""
+        """Remove a stale file; put the file back if another process has replaced it by now."""
         self._path.rename(self._aside)
         found = _fresh(self._aside)
         if (found.st_ino, found.st_mtime) != (old.st_ino, old.st_mtime):
@@ -121,14 +124,14 @@ class Lease:
         self._aside.unlink()
 
     def _now_s(self) -> float:
-        """By the clock of the file system."""
+        """The present time by the clock of the file system."""
         self._aside.touch()
         now_s = _fresh(self._aside).st_mtime
         self._aside.unlink()
         return now_s
 
     def _holder(self) -> tuple[str, str]:
-        """Host and id in the file; one that a power cut took the content of is of nobody else."""
+        """Host and id in the file; this host and no id if a power cut damaged the content."""
         try:
             found = json.loads(self._path.read_bytes())
             return ascii(found["host"])[1:-1], str(found["id"])
@@ -137,6 +140,6 @@ class Lease:
 
 
 def _fresh(path: Path) -> os.stat_result:
-    """As the server has it: NFS keeps what `stat` tells for a while, and asks when it opens."""
+    """The status of a file as the server has it: NFS caches `stat`, but asks again on open."""
     with path.open("rb") as file:
         return os.fstat(file.fileno())

@@ -1,8 +1,8 @@
-"""Reading the journal: what was acknowledged after a checkpoint, and what of it is lost.
+"""Reading the journal: finds the batches after a checkpoint, and reports those that are lost.
 
-A restart inserts what stands in the segments from the checkpoint's on, in the order of the first
-time. Damage ends with the record that it is in: what follows is found by its magic, and the numbers
-of the records tell how many batches are missing. See `journal` for what a segment looks like.
+After a restart, the batches are inserted again in their first order. A damaged record does not
+affect the records after it: the next one is found by its magic number. The numbers of the records
+show how many batches are missing. See `journal` for the format of a segment.
 """
 
 import os
@@ -32,17 +32,17 @@ from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tangram_core.wire.schema import ProtocolError, opened, read
 
 CHUNK = 2**20
-MAX_GAP = 2**32  # a number further on than this was forged
+MAX_GAP = 2**32  # a record whose number is further ahead than this is taken for damaged
 ANOTHER = "choose another run_dir, or delete its folder journal to go on without it"
 
 
 def journal_run_id(folder: Path) -> str | None:
-    """The run that a journal is of; None where there is none. RunError if of another format."""
+    """The run id in the journal, None if there is no journal; RunError for another format."""
     return next((title.run_id for _, title in _titles(folder)), None)
 
 
 def check_journal(folder: Path, task: str) -> None:
-    """Raise RunError if there is a journal of another task or format."""
+    """Raise RunError if the journal is of another task or format."""
     for path, title in _titles(folder):
         if title.task != task:
             raise _of_another(path)
@@ -64,13 +64,13 @@ def _of_another(path: Path) -> RunError:
 
 
 class Reader:
-    """The batches from a place on, in the order in which they were added.
+    """An iterable of the batches after a position in the journal, in their order.
 
-    What is read is synced first, since its senders will be told that it was inserted before: the
-    life that wrote it may have been killed before its sync.
+    Each segment is synced before it is read, because the process that wrote it may have been killed
+    before a sync, and the batches are reported to their workers as inserted.
 
     Attributes:
-        number: of the last batch that was found, or known to be lost.
+        number: number of the last batch that was found or is known to be lost.
     """
 
     def __init__(
@@ -82,14 +82,14 @@ class Reader:
         spec: EpisodeSpec,
         warn: Callable[[str], None],
     ) -> None:
-        """Read nothing yet.
+        """Store the arguments; the journal is read during the iteration.
 
         Args:
             folder: of the segments.
-            after: which a checkpoint names; None for the whole journal.
-            run_id, task: that the segments must be of.
-            spec: of the arrays.
-            warn: takes a line for each loss, and for a record that was cut short.
+            after: position of the checkpoint; None for the whole journal.
+            run_id, task: those that the segments must have.
+            spec: shapes and dtypes of the arrays.
+            warn: called with one line for each loss, and for a record that was cut short.
         """
         self._folder, self._owner, self._spec, self._warn = folder, (run_id, task), spec, warn
         self._named, known = after is not None, after or Place()
@@ -97,7 +97,7 @@ class Reader:
         self._trouble: _Trouble | None = None
 
     def __iter__(self) -> Iterator[EpisodesArrived]:
-        """Read; RunError for another run, task or format, or a disk that cannot be read."""
+        """Yield the batches; RunError for another run, task or format, or an unreadable disk."""
         try:
             found = {n: p for n, p in segments(self._folder).items() if n >= self._first}
             expected = self._first
@@ -110,8 +110,8 @@ class Reader:
                 self._lost(_missing(segment_path(self._folder, expected), 1))
         except OSError as error:
             raise RunError(
-                f"the journal in {self._folder} cannot be read ({error.strerror}): mend the disk, "
-                f"or {ANOTHER}"
+                f"the journal in {self._folder} cannot be read ({error.strerror}): repair the "
+                f"disk, or {ANOTHER}"
             ) from None
         self._end()
 
@@ -142,7 +142,7 @@ class Reader:
                 yield batch
 
     def _lost(self, where: str, number: int = 0, torn: str = "") -> None:
-        """Something is missing; how much shows when the next whole record is found."""
+        """Note a damaged part; the next intact record shows how many batches are missing."""
         last = self._trouble
         if last is None:
             self._trouble = _Trouble(where, number, torn, number > 0)
@@ -151,9 +151,10 @@ class Reader:
             self._trouble = _Trouble(last.where, max(last.number, number), torn, number > 0)
 
     def _reached(self, number: int, path: Path, start: int, another_life: bool) -> None:
-        """So many batches came before this byte."""
+        """Report the batches that are missing before an intact record; `number` came before it."""
         trouble, missing = self._trouble, number - self.number
-        # A life counts on from what it could read of the one before.
+        # A master process numbers its batches from the last one that it could read, so the numbers
+        # before and after its title do not show all losses.
         counted = another_life and start > 0
         if missing > 0:
             where = f"{path}: what came before byte {start:,} is missing"
@@ -172,18 +173,18 @@ class Reader:
             self.number += max(0, missing)
 
     def _tell(self, trouble: "_Trouble", known: str) -> None:
-        unknown = "the batches that were in there are lost, and nobody knows how many"
+        unknown = "the batches in that part are lost, and their number is unknown"
         self._warn(trouble.torn or f"{trouble.where}: {known or unknown}")
 
 
 class _Trouble(NamedTuple):
-    """A part of the journal that is not as it was written.
+    """A damaged or missing part of the journal.
 
     Attributes:
-        where: it is, for people.
-        number: of the last batch that is known to have been in there, 0 for none.
-        torn: what is said instead where nothing was lost: a kill has left it so.
-        whole: it ends with a record whose head is whole, so that no later batch was in there.
+        where: text for the warning.
+        number: number of the last batch that is known to be in the part, 0 for none.
+        torn: the warning to use if nothing was lost, because a kill left the part like this.
+        whole: whether the part ends with an intact head, so that it has no batch after `number`.
     """
 
     where: str
@@ -193,13 +194,13 @@ class _Trouble(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A part of a segment: a record, or what is none.
+    """A part of a segment: a record, or damaged bytes.
 
     Attributes:
-        start, end: bytes.
-        number: of the record, 0 where its head is damaged or its end is missing.
-        body: None where it is damaged.
-        torn: it ends as a kill leaves it.
+        start, end: offsets in bytes.
+        number: number of the record, 0 if the head is damaged or the end is missing.
+        body: of the record; None if it is damaged.
+        torn: whether the part is incomplete, as after a kill.
     """
 
     start: int
@@ -219,12 +220,12 @@ def _scan(path: Path) -> Iterator[_Found]:
             head = _read_head(file.read(HEAD.size))
             length, number, checksum = head or (0, 0, 0)
             end = start + HEAD.size + length
-            # Not asked for where it cannot be: room for it is taken first, 4 GiB of a forged head.
+            # Read no further than the file goes: a forged head could ask for 4 GiB of memory.
             body = file.read(length) if end <= size else b""
             if head is not None and len(body) == length and zlib.crc32(body) == checksum:
                 yield _Found(start, end, number, body, torn=False)
             elif head is not None:
-                # Where the next life has written on, its title begins within the torn record.
+                # The next master process appends, so its title may lie inside the torn record.
                 whole = end <= (end := min(end, _next_head(file, start + 1, size)))
                 yield _Found(start, end, number if whole else 0, None, not whole)
             else:
@@ -234,7 +235,7 @@ def _scan(path: Path) -> Iterator[_Found]:
 
 
 def _read_head(head: bytes) -> tuple[int, int, int] | None:
-    """Length, number and checksum of a body; None where the head is not whole."""
+    """Length, number and checksum of a body; None if the head is damaged."""
     if len(head) < HEAD.size:
         return None
     magic, length, number, checksum, own = HEAD.unpack(head)
@@ -244,7 +245,7 @@ def _read_head(head: bytes) -> tuple[int, int, int] | None:
 
 
 def _next_head(file: BinaryIO, start: int, size: int) -> int:
-    """Where the next whole head begins, or the end of the file."""
+    """Offset of the next intact head, or the size of the file."""
     file.seek(start)
     window = b""
     while chunk := file.read(CHUNK):
@@ -270,11 +271,11 @@ def _batches(count: int, least: bool) -> str:
 
 
 def _title(path: Path, found: _Found) -> Title | None:
-    """The title that a whole record holds, None where it is a batch.
+    """The title in an intact record, None if the record is a batch.
 
     Raises:
-        RunError: it is of another format or version.
-        WireError: it is neither.
+        RunError: the title is of another format or version.
+        WireError: the record is neither a title nor a batch.
     """
     try:
         header, _ = _parts(found.body or b"")
@@ -287,12 +288,12 @@ def _title(path: Path, found: _Found) -> Title | None:
     if header["kind"] != Title.kind:
         return None
     if header.get("format") not in (FORMAT - 1, FORMAT):
-        raise RunError(f"{path} is no segment of format {FORMAT}: {ANOTHER}")
+        raise RunError(f"{path} is not a segment of format {FORMAT}: {ANOTHER}")
     return read(Title, header)
 
 
 def _batch(body: bytes, spec: EpisodeSpec) -> EpisodesArrived:
-    """The batch that a whole record holds, checked as when it came; WireError if it is none."""
+    """The batch in an intact record, checked as on arrival; WireError if it is not a batch."""
     header, data = _parts(body)
     entry, frames = read(Entry, {"owner": "", **header}), split_frames(data)
     batch = decode_from_worker(frames, spec)
@@ -303,7 +304,7 @@ def _batch(body: bytes, spec: EpisodeSpec) -> EpisodesArrived:
 
 
 def _parts(body: bytes) -> tuple[Mapping[str, Any], bytes]:
-    """The opened header, and the joined frames."""
+    """The decoded header and the joined frames of a body."""
     if len(body) < LENGTH.size:
         raise WireError("the record is empty")
     split = LENGTH.size + LENGTH.unpack_from(body)[0]

@@ -1,4 +1,4 @@
-"""Whether a run can go on from what is in its folder, known without loading torch."""
+"""Checks whether a run can be resumed from its folder, without loading torch."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,34 +19,33 @@ from tangram_core.store.checkpoints import (
 
 
 def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
-    """Refuse another task, or a warm start from nowhere, before anything is overwritten.
+    """Refuse settings that do not fit the folder, before any file is overwritten.
 
     Raises:
-        RunError: the newest checkpoint was made of another task or networks, or by an agent whose
-            networks mean something else, or there is none, and the journal was, or the
-            run that this one is to begin with has none.
+        RunError: the newest checkpoint has another task or networks; or without a checkpoint, the
+            journal has another task, or the run of warm_start has no checkpoint.
     """
     found = list_checkpoints(folder.checkpoints)
     if not found:
-        if segments(folder.journal):  # it was killed before its first checkpoint
+        if segments(folder.journal):  # the run was killed before its first checkpoint
             check_journal(folder.journal, make_setup(resolved).task_digest())
         other = resolved.get("warm_start")
         if other is not None and not list_checkpoints(Path(other) / CHECKPOINTS):
             raise RunError(
-                f"warm_start={other} has no checkpoint: name the folder of a run that was trained"
+                f"warm_start={other} has no checkpoint: give the folder of a run with a checkpoint"
             )
         return
     try:
         counters = load_checkpoint(found[-1], stems=[]).counters
     except CorruptError:
-        return  # the one before decides, when the run is restored
+        return  # checked when the run is restored, with the checkpoint before
     check_same_task(make_setup(resolved), counters.get(SETUP, {}))
 
 
 def check_same_task(setup: Setup, contents: Mapping[str, Any]) -> None:
-    """Raise RunError unless a run of a setup with these contents can go on with this one.
+    """Raise RunError unless a run whose setup had these contents can be resumed with this setup.
 
-    The agent's rates may change on the way, but not what its networks see, give and learn from.
+    Learning rates may change, but not the inputs, outputs and training data of the networks.
     """
     odd = [name for name in setup.differences(contents) if name != "agent"]
     odd += setup.meant_otherwise(contents)

@@ -1,4 +1,4 @@
-"""The folder of one run, who may write there, and the record of what the run has been through."""
+"""The run folder, the lock on it, and the record of a run's counters."""
 
 import fcntl
 import json
@@ -30,18 +30,18 @@ LOCK, LAUNCHER, LEASE = ".lock", ".launcher", ".lease.json"
 
 
 class RunFolder:
-    """Paths of a run folder.
+    """The paths in a run folder, and the functions that read and write its files.
 
     Attributes:
-        connection: where the master can be reached; there while it runs.
-        journal: folder of what came since the last checkpoint.
+        connection: address of the master; the file exists while the master runs.
+        journal: folder of the batches since the last checkpoint.
         logs: folder of the output of workers and evaluator.
         curve: the scores of every evaluation.
-        audit: who joined, left and was refused.
+        audit: log of peers that joined, left or were refused.
         result: the scores of the final weights.
-        bad_batch: what the learner could not learn from, where that ended the run.
-        picture: the test episodes of the newest evaluation, drawn now and then, and at the end.
-        again: path -> writes it again where the folder was made anew.
+        bad_batch: the last batch before the run ended with values that are not finite.
+        picture: the test episodes of the newest evaluation; written at times and at the end.
+        again: path -> function that writes the file again if the folder was deleted and made again.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -61,7 +61,7 @@ class RunFolder:
         self.again: dict[Path, Callable[[], object]] = {}
 
     def prepare(self, resume: str) -> None:
-        """Make the folder; ConfigError if that fails, or a run is there that is not to go on."""
+        """Make the folder; ConfigError if that fails, or it holds a run and `resume` is none."""
         if resume == "none" and self.holds_run():
             raise ConfigError(
                 f"run_dir {self.path} holds a run already: choose another run_dir, or go on with "
@@ -75,33 +75,33 @@ class RunFolder:
             ) from None
 
     def holds_run(self) -> bool:
-        """Whether a run has left something here that a new one would mix with."""
+        """Whether the folder has files of a run, which a new run would mix with its own."""
         curves = self.tensorboard.is_dir() and any(self.tensorboard.iterdir())
         return curves or self.holds_more()
 
     def holds_more(self) -> bool:
-        """Whether that is more than curves, which a master may draw where its folder was."""
+        """Whether the folder has more of a run than curves, which may be written after a loss."""
         kept = bool(list_checkpoints(self.checkpoints)) or bool(segments(self.journal))
         return self.result.exists() or kept
 
     def check_never_kept(self) -> None:
-        """Refuse to begin anew, for want of a checkpoint, where a run had one.
+        """Refuse to start from nothing if the folder shows that it once had a checkpoint.
 
-        A checkpoint deletes the segments of the journal that it covers, and a result is written
-        after the last one.
+        The signs are a journal without its first segments, which a checkpoint deletes, and a result
+        without a journal.
 
         Raises:
-            RunError: its scores would be written over.
+            RunError: the folder has lost its checkpoints.
         """
         first = min(segments(self.journal), default=0)
         if first > 1 or (first == 0 and self.result.exists()):
             raise RunError(
                 f"run_dir {self.path} has lost its checkpoints: put them back into "
-                f"{self.checkpoints}, or begin anew in another run_dir"
+                f"{self.checkpoints}, or start a new run with another run_dir"
             )
 
     def has_finished(self, config: MasterConfig) -> bool:
-        """Whether a bound that this config does not raise has ended the run, scores included."""
+        """Whether the run is complete: it has its final scores, and this config raises no bound."""
         if config.resume != "auto" or not self.result.exists():
             return False
         result = read_outcome(self.result)
@@ -110,23 +110,23 @@ class RunFolder:
         return spent and result["scored_updates"] == result["updates"]
 
     def lock(self, name: str = LOCK) -> "Claim":
-        """Claim the folder for one process, until `close` or its end; TangramError if it is used.
+        """Lock the folder for this process, until `close` or the end; TangramError if it is in use.
 
         Args:
-            name: `LOCK` for who writes the run, `LAUNCHER` for who starts its processes.
+            name: `LOCK` for the process that writes the run, `LAUNCHER` for tangram-train.
         """
         return Claim(self, name)
 
     def write_again(self) -> None:
-        """Write what is missing of what was written, or read, here: the folder is a new one."""
+        """Write the missing files of the folder again, after the folder was made again."""
         for path, write in self.again.items():
             if not path.exists():
                 write()
 
     def write_config(self, resolved: Mapping[str, Any]) -> None:
-        """Write the resolved config as plain YAML, and a copy of the code that it names.
+        """Write the resolved config as plain YAML, and a copy of the user's own code, if any.
 
-        The copy is for the record: nothing loads it.
+        The copy is for the record only: no process loads it.
         """
         for setting, value in code_of(resolved).items():
             own = own_code(value)
@@ -138,13 +138,13 @@ class RunFolder:
         self._write(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
 
     def read_config(self) -> dict[str, Any]:
-        """What `write_config` wrote."""
+        """The config that `write_config` wrote."""
         data = self.config.read_bytes()
         self.again[self.config] = partial(write_whole, self.config, data, above=False)
         return dict(yaml.safe_load(data))
 
     def write_connection(self, connection: Mapping[str, Any]) -> None:
-        """Write where the master is, and the run's settings; only the user may read it."""
+        """Write the connection data and the run's settings; only the user can read the file."""
         config = self.read_config()
         shared = (*section_names(config), "service")
         settings = {name: config[name] for name in shared if name in config}
@@ -152,24 +152,24 @@ class RunFolder:
         self._write(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
 
     def write_result(self, result: Mapping[str, Any]) -> None:
-        """Write the scores of the run."""
+        """Write result.json."""
         self._write(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
 
     def _write(self, path: Path, data: bytes, mode: int = PUBLIC) -> None:
         write = partial(write_whole, path, data, mode, above=False)
-        write()  # not above: a folder that was deleted stays so
+        write()  # above=False: do not make a run folder again that was deleted
         self.again[path] = write
 
 
 class FolderError(RunError):
-    """The run folder is gone, or is another one now: nothing may be acknowledged."""
+    """The run folder is gone or was replaced by another one; no batch may be acknowledged."""
 
 
 class Claim:
-    """A run folder in which no other process works, as long as it is the one that was claimed."""
+    """An exclusive lock on a run folder, with a lease for other machines."""
 
     def __init__(self, run: RunFolder, name: str = LOCK) -> None:
-        """Claim a folder; TangramError if another process works there."""
+        """Lock the folder; TangramError if another process uses it."""
         self.run, self._name = run, name
         self._take()
 
@@ -180,13 +180,13 @@ class Claim:
         self.close()
 
     def check(self) -> bool:
-        """Claim the folder anew if its lock was deleted, or if it is new and empty.
+        """Lock the folder again if its lock file was deleted, or the folder is new and empty.
 
         Returns:
             Whether that was necessary.
 
         Raises:
-            FolderError: it is gone, or another run's, or another process works there.
+            FolderError: the folder is gone or holds another run, or another process uses it.
         """
         path = self.run.path
         try:
@@ -197,27 +197,27 @@ class Claim:
             if not path.is_dir():
                 raise FolderError(f"run_dir {path} is gone")
             if not is_same(self._folder, path) and self.run.holds_more():
-                raise FolderError(f"run_dir {path} is another folder now, with a run in it")
+                raise FolderError(f"run_dir {path} was replaced by a folder with another run")
             before, lease = (self._lock, self._folder), self._lease
             self._take()
         except LostError as error:
             raise FolderError(f"run_dir {path} is lost: {error}") from None
         except (OSError, ConfigError, UnavailableError) as error:
-            why = error.strerror if isinstance(error, OSError) else "another process works there"
-            raise FolderError(f"run_dir {path} cannot be claimed anew ({why})") from None
+            why = error.strerror if isinstance(error, OSError) else "another process uses it"
+            raise FolderError(f"run_dir {path} cannot be locked again ({why})") from None
         if lease is not None:
             lease.close()
         self._release(*before)
         return True
 
     def close(self) -> None:
-        """Give the folder back."""
+        """Release the lock and the lease."""
         if self._lease is not None:
             self._lease.close()
         self._release(self._lock, self._folder)
 
     def _take(self) -> None:
-        # Whoever can open it can lock it.
+        # The file is private, because every user who can open it can lock it.
         lock = open(self.run.path / self._name, "ab", opener=private)  # noqa: SIM115
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -237,7 +237,7 @@ class Claim:
         except UnavailableError:
             lock.close()
             raise
-        # Open, so that no folder which is made later has the same number.
+        # The folder stays open, so that its inode number is not used for another folder.
         self._lock, self._folder = lock, os.open(self.run.path, os.O_RDONLY)
 
     def _release(self, lock: IO[bytes], folder: int) -> None:
@@ -247,16 +247,16 @@ class Claim:
 
 @dataclass
 class Record:
-    """Counters that no other part keeps; a checkpoint carries them on.
+    """Counters of a run that are kept over its processes, in the checkpoints.
 
     Attributes:
-        run_id: tells runs apart; stays when a run is resumed.
-        loop_s: seconds of the loop, waiting for workers included.
-        train_s: seconds of the loop since the first episodes arrived.
-        wall_s: seconds of whole processes.
-        workers: most players connected at a time.
-        scores: of the newest evaluation, by name.
-        scored_version: of the weights that they are of; -1 before the first.
+        run_id: random id of the run; a resumed run keeps it.
+        loop_s: seconds in the main loop, including waits for workers.
+        train_s: seconds in the main loop since the first episodes arrived.
+        wall_s: seconds in all master processes.
+        workers: largest number of players connected at the same time.
+        scores: scores of the newest evaluation, by name.
+        scored_version: version of the weights with these scores; -1 before the first evaluation.
     """
 
     run_id: str = field(default_factory=lambda: secrets.token_hex(8))
@@ -268,7 +268,7 @@ class Record:
     scored_version: int = -1
 
     def score(self, scores: Mapping[str, float], version: int) -> None:
-        """Note an evaluation."""
+        """Store the scores of an evaluation and the version of its weights."""
         self.scores, self.scored_version = dict(scores), version
 
     def state(self) -> dict[str, Any]:
@@ -277,7 +277,7 @@ class Record:
 
     @staticmethod
     def of(state: Mapping[str, Any]) -> "Record":
-        """The record in a checkpoint; RunError if it lacks a field, or one is of another type."""
+        """Read the record of a checkpoint; RunError if a field is missing or has a wrong type."""
         lacking = [f.name for f in fields(Record) if f.name not in state]
         if lacking:
             raise RunError(
@@ -294,14 +294,14 @@ class Record:
 
 
 class Clock:
-    """Adds the time of this process to the record of a run."""
+    """Adds the times of this process to the record of a run."""
 
     def __init__(self, record: Record) -> None:
         self.record, self._wall_s = record, record.wall_s
         self._begun_s = self._last_s = time.monotonic()
 
     def advance(self, training: bool) -> None:
-        """Count the time since the last call as the loop's, and as training's if it is that."""
+        """Add the time since the last call to `loop_s`, and if `training` to `train_s`, too."""
         now_s = time.monotonic()
         self.record.loop_s += now_s - self._last_s
         if training:
@@ -309,6 +309,6 @@ class Clock:
         self._last_s = now_s
 
     def read(self) -> Record:
-        """The record, with the seconds of all processes of the run until now."""
+        """The record, with `wall_s` up to now."""
         self.record.wall_s = self._wall_s + time.monotonic() - self._begun_s
         return self.record

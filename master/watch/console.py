@@ -1,6 +1,6 @@
-"""What the user sees while a run goes on: a live panel on a terminal, plain lines elsewhere.
+"""Progress of a run for the user: a live panel on a terminal, plain log lines elsewhere.
 
-The console outlives its terminal: it falls silent instead of failing. Lines come through
+If the terminal is closed, the console drops its output instead of failing. Lines come through
 `logging`; with service.log_format=json each is one JSON object for programs.
 """
 
@@ -24,19 +24,18 @@ from tangram_core.wire.messages import OPEN, RunStatus
 
 PANEL_S = 0.5
 LINE_S = 10.0
-LINE = 3  # scores in a line
+LINE = 3  # number of scores in a log line
 PANEL_WIDTH = 76
-TEST = "test/"  # before the names of scores
-PLAYED = "play/reward"  # what the players got lately, exploration included
+TEST = "test/"  # prefix of the names of scores
+PLAYED = "play/reward"  # mean reward of recent episodes of the players, with exploration
 
 log = logging.getLogger(__name__)
 
 
 class _Sturdy:
-    """A text file that turns into the null device when its reader is gone, and shows what it can.
+    """A text file that drops its output when its reader is gone, and replaces unknown characters.
 
-    A closed terminal or pipe must not end a run that goes on without anybody watching, nor a clean
-    end that has still to be written down.
+    A closed terminal or pipe must not end the run, and must not disturb its clean end.
     """
 
     def __init__(self, file: TextIO) -> None:
@@ -48,7 +47,7 @@ class _Sturdy:
     def write(self, text: str) -> int:
         try:
             return self._file.write(text)
-        except UnicodeEncodeError:  # a terminal that knows fewer characters, such as LC_ALL=C
+        except UnicodeEncodeError:  # the terminal has fewer characters, as with LC_ALL=C
             known = text.encode(self._file.encoding, "replace")
             return self._file.write(known.decode(self._file.encoding))
         except OSError:
@@ -62,14 +61,14 @@ class _Sturdy:
 
     def _silence(self, text: str) -> int:
         null = os.open(os.devnull, os.O_WRONLY)
-        # Under the buffered file, whose rest is written at the interpreter's end at the latest.
+        # Replace the descriptor itself: the buffer of the file is still written to it later.
         os.dup2(null, self._file.fileno())
         os.close(null)
         return len(text)
 
 
 def sturdy_console(file: TextIO) -> Console:
-    """A console on stdout or stderr that falls silent instead of failing."""
+    """A console on stdout or stderr that drops its output instead of failing."""
     return Console(file=cast(TextIO, _Sturdy(file)))
 
 
@@ -83,7 +82,7 @@ class _TextFormatter(logging.Formatter):
 
 
 class _ConsoleHandler(logging.Handler):
-    """Lines as they are, however long; above a live panel on the same console."""
+    """Prints log lines without wrapping, above a live panel if the console has one."""
 
     def __init__(self, console: Console) -> None:
         super().__init__()
@@ -95,7 +94,13 @@ class _ConsoleHandler(logging.Handler):
 
 @contextmanager
 def logging_to(console: Console, log_format: str = "text", who: str = "master") -> Iterator[None]:
-    """Show the log lines of this room on a console, in JSON with the name of the process."""
+    """A context that shows the log lines of package master on a console.
+
+    Args:
+        console: takes the lines.
+        log_format: `text`, or `json` for one object per line.
+        who: name of the process, for `json`.
+    """
     logger, handler = logging.getLogger("master"), _ConsoleHandler(console)
     handler.setFormatter(_TextFormatter() if log_format == "text" else formatter(log_format, who))
     before = logger.level
@@ -114,9 +119,9 @@ def logging_to(console: Console, log_format: str = "text", who: str = "master") 
 def make_progress(
     console: Console, title: str, log_format: str = "text", evaluator: str = ""
 ) -> "Progress":
-    """A live panel where the console is a terminal; lines of the log elsewhere, and for JSON.
+    """A live panel if the console is a terminal and log_format is text, else log lines.
 
-    The panel shows the command that starts an evaluator while nobody scores.
+    While no evaluator takes part, the panel shows `evaluator`, a command that starts one.
     """
     if console.is_terminal and log_format == "text":
         return LivePanel(console, title, evaluator)
@@ -124,23 +129,23 @@ def make_progress(
 
 
 class StatusLines:
-    """One log line now and then: for log files, pipes and batch systems."""
+    """Shows the status as one log line at intervals, for log files, pipes and batch systems."""
 
     def __init__(self, interval_s: float = LINE_S) -> None:
         self._due = Every(interval_s, at_once=True)
 
     def show(self, status: RunStatus) -> None:
-        """Log the status if the last line is old enough; its numbers are for programs."""
+        """Log the status if a line is due; a JSON line has all numbers of the status, too."""
         if self._due.due():
             fields = {"event": "status", **status.texts, **status.numbers}
             log.info("%s", status_line(status), extra=fields)
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """Do nothing."""
 
 
 class LivePanel:
-    """A panel that is drawn again in place; log lines scroll above it."""
+    """Shows the status in a panel that is updated in place; log lines scroll above it."""
 
     def __init__(
         self, console: Console, title: str, evaluator: str = "", interval_s: float = PANEL_S
@@ -152,13 +157,13 @@ class LivePanel:
         self._live.start()
 
     def show(self, status: RunStatus) -> None:
-        """Draw the panel if the last drawing is old enough."""
+        """Draw the panel if an update is due."""
         self._last = status
         if self._due.due():
             self._draw(status)
 
     def close(self) -> None:
-        """Leave the last status and go below it."""
+        """Draw the last status and leave it on the screen."""
         if self._last is not None:
             self._draw(self._last)
         self._live.stop()
@@ -171,7 +176,7 @@ Progress: TypeAlias = StatusLines | LivePanel
 
 
 def status_line(status: RunStatus) -> str:
-    """One line for people and for grep."""
+    """The status as one line of text."""
     n = status.numbers
     parts = [
         duration(n["elapsed_s"]),
@@ -189,7 +194,7 @@ def status_line(status: RunStatus) -> str:
 
 
 def status_panel(status: RunStatus, title: str, evaluator: str = "") -> Panel:
-    """The live panel: how far, how fast, how good, and what is waited for."""
+    """The live panel with progress, rates, scores and the present activity."""
     n = status.numbers
     grid = Table.grid(padding=(0, 3), expand=True)
     for _ in range(2):
@@ -227,19 +232,19 @@ def _bar(n: Mapping[str, float]) -> Table:
 
 
 def _left(n: Mapping[str, float]) -> str:
-    """How long it still takes, where that is known."""
+    """The time left as text; empty if unknown."""
     return f", {duration(n['left_s'])} left" if n["left_s"] > 0 else ""
 
 
 def _scores(status: RunStatus) -> str:
-    """The scores that matter most, or nothing before the first evaluation."""
+    """The most important scores as text; before the first evaluation, the players' reward."""
     n = status.numbers
     found = told(read(status.texts.get("scores", ""))[:LINE], n, TEST)
     return found or (f"players' reward {n[PLAYED]:.3f}" if PLAYED in n else "")
 
 
 def _cells(status: RunStatus) -> list[tuple[str, str | Text]]:
-    """Labels and numbers of an even number of scores, the first one to be seen first."""
+    """Label and value of each score, the first one highlighted, filled up to an even number."""
     cells = list[tuple[str, str | Text]]()
     for score in read(status.texts.get("scores", "")):
         shown = score.shown(status.numbers.get(TEST + score.name))

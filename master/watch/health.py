@@ -1,4 +1,4 @@
-"""HTTP for machines: /metrics in Prometheus' format, and /healthz."""
+"""An HTTP server for monitoring: /metrics in the format of Prometheus, and /healthz."""
 
 import json
 import logging
@@ -20,21 +20,21 @@ from tangram_core.run.process import Every
 from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus
 
 OFF = -1
-# A loop that has not come round for so long hangs; a checkpoint of a large replay takes seconds.
+# Without a status for so long, the loop hangs; a checkpoint of a large replay takes seconds.
 STALLED_S = 120.0
 COUNTERS = "hub/"
-MAX_OPEN = 64  # requests at once: each holds a thread and a descriptor
-REQUEST_S = 10.0  # that a client may take from its connection to the end of its answer
+MAX_OPEN = 64  # requests at the same time: each needs a thread and a descriptor
+REQUEST_S = 10.0  # longest time from a client's connection to the end of the answer
 TELL_S = 60.0
 
 log = logging.getLogger(__name__)
 
 
 class Health:
-    """A small HTTP server in threads of its own; port 0 is any free one.
+    """A small HTTP server in its own threads; port 0 means any free port.
 
     Attributes:
-        url: where it listens.
+        url: address of the server.
 
     Raises:
         ConfigError: the address cannot be used.
@@ -58,20 +58,20 @@ class Health:
         self._thread.start()
 
     def update(self, status: RunStatus) -> None:
-        """Show another status from now on."""
+        """Set the status to show."""
         self._status, self._seen_s = status, time.monotonic()
 
     def answer(self, path: str) -> tuple[int, str, bytes]:
-        """Status, type and body of a page."""
+        """HTTP status code, content type and body for a path."""
         if path == "/metrics":
             return 200, CONTENT_TYPE_LATEST, generate_latest(self._registry)
         if path == "/healthz":
             code, content = self.health()
             return code, "application/json", json.dumps(content).encode() + b"\n"
-        return 404, "text/plain", b"there are /metrics and /healthz\n"
+        return 404, "text/plain", b"not found: use /metrics or /healthz\n"
 
     def health(self) -> tuple[int, dict[str, Any]]:
-        """200 while the loop goes round, 503 when it hangs."""
+        """HTTP status code and content of /healthz: 200, or 503 if the loop hangs."""
         silent_s = time.monotonic() - self._seen_s
         ok = silent_s < STALLED_S
         texts = {} if self._status is None else dict(self._status.texts)
@@ -79,7 +79,7 @@ class Health:
         return (200 if ok else 503), {"status": state, **texts}
 
     def collect(self) -> Iterator[Metric]:
-        """Prometheus' families of the last status."""
+        """Yield the last status as metric families of Prometheus."""
         status = self._status
         if status is None:
             return
@@ -108,7 +108,7 @@ class Health:
 
 
 class _Server(ThreadingHTTPServer):
-    """Few requests at once, none for long, and what goes wrong with them in one line a minute."""
+    """Limits the number and duration of requests, and logs failures in one line per minute."""
 
     daemon_threads = True
     request_queue_size = MAX_OPEN
@@ -133,7 +133,7 @@ class _Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """Called by the library twice a second: hang up on the slow, and tell what was lost."""
+        """End slow requests and log failures; the library calls this twice a second."""
         latest_s = time.monotonic() - REQUEST_S
         for request, begun_s in list(self._begun.items()):
             if begun_s <= latest_s:
@@ -146,7 +146,7 @@ class _Server(ThreadingHTTPServer):
             log.warning(told, lost, self._why, extra={"event": "http", "lost": lost})
 
     def handle_error(self, _: Any, client_address: Any) -> None:
-        """In place of the library's traceback: most often a client has hung up."""
+        """Count a failure instead of printing a traceback: most often a client has disconnected."""
         self._lose(client_address, repr(sys.exception()))
 
     def _lose(self, client_address: Any, why: str) -> None:
@@ -166,4 +166,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
-        """Log nothing: a scraper asks every few seconds."""
+        """Log nothing: a monitoring system asks every few seconds."""

@@ -1,8 +1,8 @@
-"""The curves of a run: TensorBoard, what is written, under which name, against what.
+"""The curves of a run, for TensorBoard and in `curve.jsonl`.
 
-Curves are drawn against updates. All of it is one run in TensorBoard's list; docs/tensorboard.md
-explains every tag. For plots without TensorBoard, or against episodes or seconds, `curve.jsonl` has
-the evaluations, one JSON object a line.
+The x axis of the curves is the number of updates. TensorBoard lists all of them as one run;
+docs/tensorboard.md explains every tag. `curve.jsonl` has the evaluations as JSON lines, for plots
+without TensorBoard, or against episodes or seconds.
 """
 
 import json
@@ -29,15 +29,15 @@ from tangram_core.store.files import make_folders, write_whole
 
 FLUSH_S = 30
 RETRY_S = 60.0
-POINT = ("updates", "episodes", "train_s")  # where an evaluation stands
-POINTS = 2000  # of a curve; with each factor of e in the run's age as many more
-HPARAMS = ("seed", "updates", "episodes", "workers", "train_s")  # beside what tells task and agent
+POINT = ("updates", "episodes", "train_s")  # x values of an evaluation
+POINTS = 2000  # about as many points are added each time the run's age grows by a factor of e
+HPARAMS = ("seed", "updates", "episodes", "workers", "train_s")  # besides facts on task and agent
 
 log = logging.getLogger(__name__)
 
 
 class Means:
-    """Means of named values since they were last taken."""
+    """Means of named values since the last `take`."""
 
     def __init__(self) -> None:
         self._sums: defaultdict[str, float] = defaultdict(float)
@@ -50,7 +50,7 @@ class Means:
             self._counts[name] += count
 
     def take(self) -> dict[str, float]:
-        """The means, and begin anew."""
+        """Return the means and start again from nothing."""
         means = {name: total / self._counts[name] for name, total in self._sums.items()}
         self._sums.clear()
         self._counts.clear()
@@ -58,14 +58,14 @@ class Means:
 
 
 class Thinning:
-    """Lets points of a curve through, ever fewer: a run of a year must not fill the disk."""
+    """Selects points of a curve, ever more rarely, so that a long run does not fill the disk."""
 
     def __init__(self, age_s: float, points: int = POINTS) -> None:
-        """Begin with a run that is so old."""
+        """Start at this age of the run; it gets `points` points each time its age grows e-fold."""
         self._points, self._begun_s, self._last_s = points, time.monotonic() - age_s, -math.inf
 
     def due(self) -> bool:
-        """Whether there is a point now."""
+        """Whether to write a point now; counts as written."""
         now_s = time.monotonic()
         if now_s - self._last_s < (now_s - self._begun_s) / self._points:
             return False
@@ -74,11 +74,11 @@ class Thinning:
 
 
 class Metrics:
-    """Writes the curves of one run: to TensorBoard, and evaluations to curve.jsonl, too.
+    """Writes the curves of one run for TensorBoard, and evaluations to curve.jsonl, too.
 
-    What the disk does not take is left out, and told: curves are not worth a run. Points of an
-    earlier process after the checkpoint that the run goes on from, with so many updates, are hidden
-    or dropped, since they happen again. What lies in their place and is none is set aside.
+    If the disk fails, points are missing and a warning is logged, but the run goes on. A resumed
+    run starts at the checkpoint's `updates` and repeats what came after. So older points beyond
+    `updates` are hidden or deleted. A file with wrong content in the way is renamed.
     """
 
     def __init__(self, folder: Path, curve: Path, updates: int = 0, age_s: float = 0.0) -> None:
@@ -93,7 +93,7 @@ class Metrics:
         self._open(updates + 1 if updates else None)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
-        """Points of many curves at one step."""
+        """Write a point of several curves at one step."""
 
         def write() -> None:
             for name, value in values.items():
@@ -104,7 +104,7 @@ class Metrics:
     def scores(
         self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float
     ) -> None:
-        """An evaluation of the weights after so many updates, episodes, seconds of training."""
+        """Write the scores of weights after so many updates, episodes and seconds of training."""
         if not self._evaluated.due():
             return
         self.scalars({f"test/{name}": value for name, value in scores.items()}, updates)
@@ -117,22 +117,22 @@ class Metrics:
             log.warning("%s cannot be written (%s): a score is missing", self._curve, why)
 
     def picture(self, pixels: Pixels, updates: int) -> None:
-        """The test episodes (height, width, 3) after so many updates."""
+        """Write the picture of the test episodes, (height, width, 3), after so many updates."""
         content = np.asarray(pixels)
         self._try(
             lambda: self._writer.add_image("test/pictures", content, updates, dataformats="HWC")
         )
 
     def settings(self, resolved: Mapping[str, Any]) -> None:
-        """The whole config as text."""
+        """Write the whole config as text."""
         text = yaml.safe_dump(dict(resolved), sort_keys=False)
         indented = "".join(f"    {line}\n" for line in text.splitlines())
         self._try(lambda: self._writer.add_text("config", indented))
 
     def hyperparameters(self, result: Mapping[str, Any], facts: Collection[str]) -> None:
-        """What runs are compared by in the HPARAMS tab, and which curves end in their scores.
+        """Write the values and scores with which TensorBoard's HPARAMS tab compares runs.
 
-        `facts` are the names in result.json of what tells task and agent.
+        `facts` are the names of the facts about task and agent in `result`.
         """
         values = {name: _plain(result[name]) for name in (*HPARAMS, *facts)}
         tags = {f"test/{score.name}": 0.0 for score in read(result["scores"])[:SHOWN]}
@@ -146,22 +146,22 @@ class Metrics:
         self._try(write)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write what is buffered and close the files."""
         self._try(self._writer.close)
         threading.excepthook = self._hook
 
     def _thread_failed(self, failure: threading.ExceptHookArgs) -> None:
-        """TensorBoard's thread fails where the disk does, and its next write here tells it."""
+        """Ignore disk errors in TensorBoard's thread: the next write here reports them."""
         ours = type(failure.thread).__module__.startswith("tensorboard.")
         if not (ours and isinstance(failure.exc_value, OSError)):
             self._hook(failure)
 
     def _open(self, purge: int | None) -> None:
-        make_folders(self._folder, above=False)  # a run folder that was deleted stays so
+        make_folders(self._folder, above=False)  # do not make a run folder again that was deleted
         self._writer = SummaryWriter(str(self._folder), purge_step=purge, flush_secs=FLUSH_S)
 
     def _keep(self, updates: int) -> None:
-        """Drop evaluations that happen again, and what is none."""
+        """Delete evaluations after `updates`, and damaged lines, from curve.jsonl."""
         try:
             before = self._curve.read_bytes()
             kept = [line for line in _lines(before) if line["updates"] <= updates]
@@ -172,7 +172,7 @@ class Metrics:
             _set_aside(self._curve)
 
     def _try(self, write: Callable[[], object]) -> None:
-        """Write, unless the disk did not take anything a short while ago."""
+        """Call `write`, unless the disk failed less than `RETRY_S` ago."""
         if self._broken and not self._again.due():
             return
         try:
@@ -182,14 +182,14 @@ class Metrics:
             write()
         except OSError as error:
             if not self._broken:
-                log.warning("curves cannot be written (%s): a gap is left in them", error.strerror)
+                log.warning("curves cannot be written (%s): points are missing", error.strerror)
                 with suppress(OSError):
                     self._writer.close()
             self._broken, self._again = True, Every(RETRY_S)
 
 
 def _plain(value: Any) -> float | str:
-    """As the HPARAMS tab takes it."""
+    """A value as the HPARAMS tab accepts it: a number or text."""
     return value if isinstance(value, int | float | str) else "+".join(map(str, value))
 
 
@@ -198,16 +198,16 @@ def _text(line: Mapping[str, Any]) -> str:
 
 
 def _set_aside(path: Path) -> None:
-    """Give another name to what is in the way; if that fails, too, curves have a gap."""
+    """Rename a file or folder that is in the way; if that fails, too, points are missing."""
     try:
         aside = path.rename(path.with_name(f"{path.name}.{time.time():.0f}.aside"))
-        log.warning("%s was no curve that can be gone on with: it is %s now", path, aside.name)
+        log.warning("%s was not a readable curve: it was renamed to %s", path, aside.name)
     except OSError as error:
         log.warning("%s is in the way of curves (%s)", path, error.strerror)
 
 
 def _lines(data: bytes) -> list[dict[str, Any]]:
-    """What an earlier process wrote; a line that was cut short or damaged is left out."""
+    """The evaluations of an earlier process, without lines that are damaged or cut short."""
     found = []
     for text in data.splitlines():
         try:

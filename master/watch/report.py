@@ -1,4 +1,4 @@
-"""How the run stands, collected once, and told at bounded rates to everybody who shows it."""
+"""The status of a run: collected in one place, and passed at bounded rates to all outputs."""
 
 import json
 import logging
@@ -32,19 +32,19 @@ from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus, Scores
 
 UNKNOWN = -1.0
 PICTURE_S = 30.0
-PICTURES = 100  # in TensorBoard, as POINTS
+PICTURES = 100  # in TensorBoard; see POINTS in `metrics`
 TICK_S = 0.1
 LISTEN_S = 1.0
-LOG_S = 2.0  # between two lines of progress, and of the curves
+LOG_S = 2.0  # between two points of the curves
 
 log = logging.getLogger(__name__)
 
 
 class StatusCollector:
-    """Puts together how the run stands; whoever shows something of it reads it from there.
+    """Collects the status of a run; all outputs show numbers of this status.
 
     Attributes:
-        played: the reward of what was played lately, by its name.
+        played: mean reward of recent episodes, by its name.
     """
 
     def __init__(
@@ -62,17 +62,17 @@ class StatusCollector:
         self.played: dict[str, float] = {}
 
     def mark(self) -> None:
-        """Note the counters, from which rates follow; a few times in a second."""
+        """Note the counters, to compute rates; call this a few times per second."""
         trainer, share = self._guard.trainer, self._budget.share
         now_s, busy_s = time.monotonic(), time.thread_time()
         self._rates.mark(now_s, trainer.transitions, trainer.updates, share, busy_s)
 
     def collect(self, queue: int, each: bool = True) -> RunStatus:
-        """The present state.
+        """The present status.
 
         Args:
-            queue: batches that have come and wait for their insert.
-            each: with a row for each worker, which takes milliseconds where there are many.
+            queue: number of batches that wait for their insert.
+            each: include a row for each worker, which takes milliseconds if there are many.
         """
         trainer, record, rates = self._guard.trainer, self._clock.read(), self._rates
         players, left_s = self._hub.count("player"), rates.left_s()
@@ -104,7 +104,7 @@ class StatusCollector:
             **{TEST + name: value for name, value in record.scores.items()},
             **self.played,
             **(self._balance() if each else {}),
-            # Last: where there are more numbers than a status takes, these are left out.
+            # These come last, because numbers beyond the limit of a status are left out.
             **{f"hub/{name}": count for name, count in sorted(self._hub.counters.items())},
         }
         texts = {
@@ -116,7 +116,7 @@ class StatusCollector:
         return RunStatus(numbers, texts, _workers(self._hub.peers if each else (), trainer.updates))
 
     def _balance(self) -> dict[str, float]:
-        """Transitions per second if each process had a core and never waited."""
+        """Transitions per second that players and learner could reach if they never waited."""
         trainer = self._guard.trainer
         return {
             "could_play": could_play(self._hub.peers, trainer.setup.spec.horizon),
@@ -124,11 +124,11 @@ class StatusCollector:
         }
 
 
-HOMELESS = "waiting for the run folder, which is gone or another one"
+HOMELESS = "waiting for the run folder, which is gone or was replaced"
 
 
 def activity(trainer: Trainer, players: int) -> str:
-    """What happens, or what is waited for."""
+    """The present activity as text, such as `learning` or `waiting for episodes`."""
     limiter, starts = trainer.rate_limiter, trainer.pace.learning_starts
     if limiter.may_update():
         faster = players and not limiter.may_insert()
@@ -143,7 +143,7 @@ def activity(trainer: Trainer, players: int) -> str:
 
 
 def could_play(peers: Iterable[Peer], horizon: int) -> float:
-    """Transitions per second of all players, each with a core and never waiting; 0: unknown."""
+    """Transitions per second of all players if each had a core and never waited; 0 if unknown."""
     told = [peer.stats for peer in peers if peer.role == "player"]
     found = [(one.get("episodes", 0.0), one.get("busy_s", 0.0)) for one in told]
     rates = [episodes / seconds for episodes, seconds in found if seconds > 0.0]
@@ -172,7 +172,7 @@ def _row(peer: Peer, now_s: float, updates: int) -> list[float]:
 
 @dataclass(frozen=True)
 class Sent:
-    """Monotonic time, episodes taken in and seconds of training when weights were sent."""
+    """Monotonic time, inserted episodes and seconds of training when weights were broadcast."""
 
     at_s: float
     episodes: int
@@ -180,9 +180,9 @@ class Sent:
 
 
 class Reporter:
-    """Collects what happens between two reports, and passes them on.
+    """Collects events of the loop and reports them to console, curves and listeners.
 
-    Listeners get the status about once in a second; `picture` is where test episodes are drawn.
+    Listeners get the status about once per second; `picture` is the file for the test episodes.
     """
 
     def __init__(
@@ -206,17 +206,17 @@ class Reporter:
         self._latest: Scores | None = None
 
     def published(self, version: int) -> None:
-        """Note when weights were sent, and which episodes they had learned from."""
+        """Note when a version of the weights was broadcast, after how many episodes."""
         self._published.setdefault(version, self._now())
         while len(self._published) > REMEMBERED_VERSIONS:
             self._published.popitem(last=False)
 
     def updated(self, losses: Mapping[str, float]) -> None:
-        """Note one update."""
+        """Note the losses of one update."""
         self._losses.add(losses)
 
     def inserted(self, arrival: EpisodesArrived) -> None:
-        """Note a batch that went into the replay."""
+        """Note a batch that was inserted into the replay buffer."""
         episodes = arrival.episodes
         values = {
             PLAYED: float(np.mean(episodes.rewards[:, -1])),
@@ -228,23 +228,23 @@ class Reporter:
         self._play.add(values, episodes.count)
 
     def scored(self, scores: Scores) -> None:
-        """An evaluation of weights that were sent a while ago: record, curves and a picture."""
+        """Add an evaluation of earlier weights to the record, the curves and the picture."""
         self._record.score(scores.scalars, scores.weights_version)
         self._latest = scores
         values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
         updates = scores.weights_version
         sent = self._published.get(updates, self._now())
         self.metrics.scores(values, updates, sent.episodes, sent.train_s)
-        # Writing it takes time from learning.
+        # At intervals, since drawing takes time from learning.
         if len(scores.picture) and self._picture.due():
             if self._shown.due():
                 half = Image.fromarray(scores.picture).reduce(2)
                 self.metrics.picture(np.asarray(half), updates)
-            with suppress(RunError):  # a disk that fails is told where the run needs it
+            with suppress(RunError):  # the journal reports a disk that fails
                 self.draw()
 
     def tick(self, queue: int) -> None:
-        """Tell how the run stands where it is time, and write the curves; see `collect`."""
+        """Report the status and write the curves if they are due; `queue` as in `collect`."""
         if not self._tick.due():
             return
         self._status.mark()
@@ -259,7 +259,7 @@ class Reporter:
                 listen(status)
 
     def flush(self, queue: int) -> RunStatus:
-        """Tell it now, whatever the time, and return what was told."""
+        """Report the status at once, and return it; write a point of the curves if it is due."""
         played = self._play.take()
         if PLAYED in played:
             self._status.played = {PLAYED: played[PLAYED]}
@@ -272,13 +272,13 @@ class Reporter:
         values = {f"train/{name}": value for name, value in self._losses.take().items()}
         values |= played
         for name, value in status.numbers.items():
-            if not name.startswith((TEST, PLAYED)):  # those are written when they come
+            if not name.startswith((TEST, PLAYED)):  # these are written elsewhere
                 values[name if "/" in name else f"run/{name}"] = value
         self.metrics.scalars(values, self._trainer.updates)
         return status
 
     def draw(self) -> None:
-        """Write the picture of the last evaluation, if any; RunError if the disk is full."""
+        """Write the picture of the last evaluation, if there is one; RunError if the disk fails."""
         if self._latest is not None and len(self._latest.picture):
             drawn = BytesIO()
             Image.fromarray(self._latest.picture).save(drawn, "PNG")

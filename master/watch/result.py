@@ -1,4 +1,4 @@
-"""What a run has come to: result.json and the last words to the user."""
+"""The result of a run: result.json, and the final table for the user."""
 
 import logging
 import os
@@ -36,10 +36,10 @@ def make_result(
     seed: int,
     reason: str,
 ) -> dict[str, Any]:
-    """The content of result.json; scores are null where no evaluator sent any.
+    """The content of result.json; scores are null if no evaluator sent any.
 
-    `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
-    `facts` are those of the trainer.
+    `scored_updates` is the version of the scored weights; it equals `updates` for the final ones.
+    `facts` come from `Trainer.facts`.
     """
     n = status.numbers
     scored = int(n["scored_updates"])
@@ -70,9 +70,9 @@ def show_result(
     code: Mapping[str, str],
     go_on: str = "",
 ) -> None:
-    """The final table, where everything lies, and what to do with it.
+    """Print the final table, the paths of the results, and commands to use them.
 
-    `go_on` is the command that goes on with it; shown where a signal has ended it.
+    `go_on` is the command that resumes the run; it is shown if a signal ended the run.
     """
     table = Table(show_header=False, box=None, padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
@@ -85,7 +85,7 @@ def show_result(
     curves, where = _installed("tensorboard"), shlex.quote(str(folder.tensorboard))
     paths = [("run folder", str(folder.path)), ("curves", f"{curves} --logdir {where}")]
     run = {"run_dir": folder.path}
-    if folder.picture.exists():  # so it can be drawn
+    if folder.picture.exists():  # so the task can draw episodes
         paths.insert(1, ("picture", str(folder.picture)))
         watch = command_line("tangram-play", {**run, "out": folder.path / "play.gif", **code})
         paths.append(("watch it play", watch))
@@ -99,10 +99,10 @@ def show_result(
 
 
 def show_finished(folder: RunFolder, log_format: str, code: Mapping[str, str]) -> None:
-    """The result of a run that was to go on, and has nothing left to do."""
+    """Show the result of a run that was to be resumed but is already complete."""
     result = read_outcome(folder.result)
-    said = f"{folder.path} has finished ({result['ended_by']}): nothing is changed, a higher "
-    said += "bound goes on"
+    said = f"{folder.path} has finished ({result['ended_by']}): nothing is changed; set a higher "
+    said += "bound to go on"
     if log_format == "json":
         log.info("%s", said, extra={"event": "result", **result})
         return
@@ -112,14 +112,14 @@ def show_finished(folder: RunFolder, log_format: str, code: Mapping[str, str]) -
 
 
 def command_line(name: str, settings: Mapping[str, object]) -> str:
-    """A command of this installation with settings, to be pasted into a shell."""
+    """A command with settings, quoted for a shell."""
     return " ".join([_installed(name), *(argument(*pair) for pair in settings.items())])
 
 
 def go_on_command(folder: RunFolder, launched: bool) -> str:
-    """The command that goes on with a run, with all that `from_config` does not take.
+    """The command that resumes a run, with the settings that `from_config` does not load.
 
-    A master that was launched is not told how many workers there are: config.yaml is.
+    The settings come from config.yaml, because a launched master does not know `workers`.
     """
     given = folder.read_config()
     names = ("seed", "max_hours", "max_episodes", "max_updates", "workers")
@@ -134,12 +134,12 @@ def go_on_command(folder: RunFolder, launched: bool) -> str:
 
 
 def _installed(name: str) -> str:
-    """A command of this environment as a shell finds it, which may not have the environment on."""
+    """A command as a shell can find it: its name, or its path if the environment is not active."""
     return name if which(name) else shlex.quote(str(Path(sys.executable).with_name(name)))
 
 
 def versions() -> dict[str, str]:
-    """Python and the packages that decide the numbers."""
+    """Versions of Python and of the packages that affect the results."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -150,7 +150,7 @@ def versions() -> dict[str, str]:
 
 
 def commit(root: Path = ROOT) -> str | None:
-    """The commit of the source tree that runs, `-dirty` if it was changed; None elsewhere."""
+    """Git commit of the source tree, `-dirty` if it was changed; None outside a git tree."""
     if not (root / ".git").exists():
         return None
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"]
@@ -162,7 +162,7 @@ def commit(root: Path = ROOT) -> str | None:
 
 
 def processor() -> str:
-    """The processor's name, where the system tells it."""
+    """The name of the processor, as far as the system knows it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,1 +1,1 @@
-"""The agents, a folder for each: what one of them needs and the others do not."""
+"""The agents: each folder has the modules that only one agent uses."""

@@ -1,4 +1,4 @@
-"""What agents of tokens share: learning by gradients, DDPG with hindsight, acting, settings.
+"""Shared parts of agents of tokens: gradient learning, DDPG with hindsight, acting, settings.
 
-Start with `learning.py`, then `ddpg.py`. Knows no agent: imports none of tangram_agent.agents.
+Start with `learning.py`, then `ddpg.py`. Must not import tangram_agent.agents.
 """

@@ -1,4 +1,4 @@
-"""What all actors of networks share: weights on the CPU, and the exploration of one velocity."""
+"""Base class of actors with a network on the CPU, and the actions made of its outputs."""
 
 from collections.abc import Mapping
 
@@ -13,10 +13,10 @@ from tangram_tasks.place import Place
 
 
 class NetworkActor(Actor):
-    """Acts with a network.
+    """Base class of actors with one network.
 
     Attributes:
-        network: what the weights are of.
+        network: the network whose weights are loaded.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -24,28 +24,28 @@ class NetworkActor(Actor):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of all parameters that a broadcast brings."""
+        """Shapes of the parameters in a broadcast, by name."""
         every = self.network.named_parameters()
         return {name: tuple(p.shape) for name, p in every if self.needs(name)}
 
     def needs(self, name: str) -> bool:  # noqa: ARG002
-        """Whether a parameter is needed to play."""
+        """Whether the parameter of this name is needed to act."""
         return True
 
     def load(self, weights: Mapping[str, Singles]) -> None:
-        """Take over a broadcast, or all weights as a checkpoint keeps them."""
+        """Load the weights of a broadcast, or all weights of a checkpoint."""
         whole = len(weights) > len(self.shapes)
         load_arrays(self.network, weights, None if whole else self.shapes)
 
 
 def as_actions(token: Tensor, flip: Tensor | None, velocity: Tensor, task: Place) -> Tensor:
-    """Actions (B, A) as `tangram_sim.motion.actions.make_actions` makes them, in single precision.
+    """Actions (B, A) in float32, as in `tangram_sim.motion.actions.make_actions`.
 
     Args:
-        token: (B,) which one moves.
-        flip: (B,) 1 where it is turned over; None: none is.
+        token: (B,) index of the token that moves.
+        flip: (B,) 1 where the token is turned over; None: nowhere.
         velocity: (B, 3) in [-1, 1].
-        task: says what an action is made of.
+        task: defines the entries of an action.
     """
     tokens, parts = task.layout.tokens, list[Tensor]()
     if tokens > 1:
@@ -57,5 +57,5 @@ def as_actions(token: Tensor, flip: Tensor | None, velocity: Tensor, task: Place
 
 
 def tensor(array: object) -> torch.Tensor:
-    """A copy in single precision: arrays that came over the wire are read-only."""
+    """A copy of an array as a float32 tensor; arrays from the network are read-only."""
     return torch.from_numpy(np.array(array, np.float32))

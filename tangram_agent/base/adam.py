@@ -1,4 +1,4 @@
-"""Adam as torch.optim has it, without the compiler of torch: its import takes 1.4 s and 70 MB."""
+"""Adam as in torch.optim, without the import of torch's compiler, which takes 1.4 s and 70 MB."""
 
 import math
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ NAMES = ("step", "exp_avg", "exp_avg_sq")
 
 
 class Adam:
-    """Steps of parameters along their gradients.
+    """The optimiser Adam for a list of parameters.
 
     Attributes:
-        slots: what is kept of every parameter, by the names of torch.optim. These tensors stay the
-            same, as do the parameters: a compiled update holds on to them.
+        slots: the state of every parameter, by the names of torch.optim. Its tensors and the
+            parameters are only changed in place: a compiled update refers to them.
     """
 
     def __init__(self, parameters: Sequence[Tensor]) -> None:
@@ -30,10 +30,10 @@ class Adam:
         )
 
     def load(self, slots: dict[str, list[Tensor]]) -> None:
-        """Take over what was kept of the same parameters; nothing is as before the first step.
+        """Load the `slots` of the same parameters; an empty dict resets the optimiser.
 
         Raises:
-            RunError: it is of other parameters.
+            RunError: the slots belong to other parameters.
         """
         wanted, found = (
             {name: [(one.shape, one.dtype) for one in own] for name, own in kept.items()}
@@ -41,8 +41,8 @@ class Adam:
         )
         if slots and found != wanted:
             raise RunError(
-                "the optimiser's averages are not those of this network: start a new run, "
-                "warm_start=RUN_DIR takes its networks alone"
+                "the optimiser's averages belong to another network: start a new run; "
+                "warm_start=RUN_DIR takes only the networks of a run"
             )
         for name, own in self.slots.items():
             for i, one in enumerate(own):
@@ -50,26 +50,26 @@ class Adam:
 
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor], rate: float | Tensor, traced: bool = False) -> None:
-        """One step along the gradient of each parameter.
+        """Make one step of all parameters.
 
         Args:
             gradients: one for each parameter.
-            rate: of this step; a tensor of one number where it is part of a graph.
-            traced: whether it is told in operations that a compiler can fuse, of a tensor as its
-                rate; else one kernel of torch does it all.
+            rate: learning rate of this step; a tensor of one number inside a graph.
+            traced: whether to use single operations, which a compiler can fuse; `rate` must be a
+                tensor then. Otherwise one kernel of torch makes the whole step.
         """
         steps, means, squares = (self.slots[name] for name in NAMES)
         if traced:
             for step in steps:
                 step.add_(1.0)
-            # 1 - beta^t, without the digits that it loses while t is small.
+            # 1 - beta^t, by a formula that keeps all digits at small t.
             whole, square = (-torch.expm1(math.log(beta) * steps[0]) for beta in BETAS)
             for one in zip(self._parameters, gradients, means, squares, strict=True):
                 _told(*one, rate / whole, square)
             return
         adam(
             self._parameters,
-            [one.contiguous() for one in gradients],  # it reads memory as it lies
+            [one.contiguous() for one in gradients],  # the kernel ignores strides
             means,
             squares,
             max_exp_avg_sqs=[],

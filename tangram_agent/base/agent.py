@@ -1,4 +1,4 @@
-"""What agents of tokens share, without tensors."""
+"""Base class of agents of tokens; does not import torch."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -17,27 +17,27 @@ if TYPE_CHECKING:  # needs torch
 
 @dataclass(frozen=True)
 class TokenAgent(Agent):
-    """Its networks learn from a replay; extend it with `sections`, `actor` and `learns`."""
+    """An agent that learns from a replay buffer; subclasses add `sections`, `actor`, `learns`."""
 
     config: LearningConfig
     net: NetConfig
 
     @property
     def pace(self) -> Pace:
-        """As its settings say."""
+        """The pace in the settings."""
         return Pace(self.config.updates_per_transition, self.config.learning_starts)
 
     def check(self, task: Task) -> None:
-        """Refuse a replay that holds no episode."""
+        """Refuse a replay buffer that is too small for one episode."""
         capacity, horizon = self.config.replay_capacity, task.spec.horizon
         if capacity < horizon:
             raise ConfigError(
-                f"agent.replay_capacity must hold an episode, {horizon} actions, got {capacity}"
+                f"agent.replay_capacity must hold one episode, at least {horizon}, got {capacity}"
             )
 
     @abstractmethod
     def learns(self) -> "Callable[[Any, Any, int, str, bool], TokenLearner]":
-        """The class of its learner: of the agent, a task, a seed, a device, and `compiled`."""
+        """The learner's class; it takes the agent, a task, a seed, a device and `compiled`."""
 
     def learner(
         self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
@@ -46,19 +46,19 @@ class TokenAgent(Agent):
         return self.learns()(self, task, seed, device, compiled)
 
     def facts(self) -> Json:
-        """Its preset and its network."""
+        """Name of the preset and kind of network, for reports."""
         return {"agent": self.config.name, "net": self.net.kind}
 
 
 def seen_tokens(task: Task, kind: str) -> Place:
-    """The task, if it is one of tokens whose target is seen piece by piece.
+    """The task, if it has tokens and shows the pieces of its target.
 
     Raises:
-        ConfigError: names the agent and what to set.
+        ConfigError: it is another task; names the agent and the remedy.
     """
     if not isinstance(task, Place) or task.outlines:
         raise ConfigError(
-            f"agent.kind={kind} plays tokens whose target it sees: set task=place, or another "
-            "agent, as agent=goal for fields that are numbers"
+            f"agent.kind={kind} needs tokens and the pieces of a target: set task=place, or "
+            "another agent, such as agent=goal for fields of numbers"
         )
     return task

@@ -1,10 +1,10 @@
-"""One update as a whole: both gradients, both optimisers and all averages.
+"""One update as a single graph: the gradients, the optimisers and all averages.
 
-An update of small networks is a thousand small operations, and most of its time goes from one to
-the next. On a GPU they are recorded once as a CUDA graph, which the processor asks for as a whole.
-Compiled, the update is traced once, as it is, and torch's compiler makes one piece of C++ of it, or
-kernels of Triton for the graph. What was compiled is kept in a folder for the next run; its numbers
-differ from those of single operations in their last digits, so a run stays with it or without it.
+An update of small networks has a thousand small operations, and most of its time goes into starting
+them. On a GPU they are recorded once as a CUDA graph, which is started as a whole. With
+service.compile=true torch's compiler turns the update into C++ code, or into Triton kernels for the
+CUDA graph. The compiled code is kept in a folder for later runs. Its numbers differ from those of
+single operations in the last digits, so a run cannot change this setting.
 """
 
 import logging
@@ -27,7 +27,7 @@ from tangram_core.errors import RunError
 
 _CACHE_SETTING = "TORCHINDUCTOR_CACHE_DIR"
 _FLAGS = re.compile(rb"^(?:flags|Features)\s*:(.*)$", re.MULTILINE)
-# Of arguments and rates: as a graph takes them, and as it is called.
+# Functions of arguments and rates: inside a graph the rates are tensors, outside numbers.
 Call = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]
 Called = Callable[[list[Tensor], list[float]], Tensor]
 
@@ -35,10 +35,10 @@ log = logging.getLogger(__name__)
 
 
 def cache_folder() -> Path:
-    """Where compiled updates are kept: what one processor runs another one may not.
+    """The folder of compiled updates, one for each version of torch and each kind of processor.
 
-    A home is often shared by many machines, so each version of torch and each kind of processor has
-    its own folder. torch's own setting comes first.
+    Many machines may share a home directory, and one processor's code may not run on another. The
+    environment variable TORCHINDUCTOR_CACHE_DIR comes first.
     """
     processor = Path("/proc/cpuinfo")
     found = _FLAGS.search(processor.read_bytes()) if processor.exists() else None
@@ -48,20 +48,20 @@ def cache_folder() -> Path:
 
 
 class Whole:
-    """A function of tensors in dataclasses, and of rates, that changes other tensors in place.
+    """A function as one graph: of tensors in a dataclass and rates, changing tensors in place.
 
-    On a GPU it is recorded; compiled it is where that is wanted.
+    On a GPU the function is recorded as a CUDA graph. It is compiled on request.
     """
 
     def __init__(
         self, function: Callable[..., Tensor], changed: Sequence[Tensor], compiled: bool
     ) -> None:
-        """Make a graph of it when it is called first, and for each form of its arguments.
+        """Keep the function; the first call with each form of arguments makes a graph.
 
         Args:
-            function: of a dataclass and of a tuple of rates.
-            changed: what it changes; these must stay the same tensors.
-            compiled: by torch's compiler; else it stays the single operations that it is made of.
+            function: takes a dataclass and a tuple of rates.
+            changed: the tensors that the function changes in place; never replace them.
+            compiled: whether to use torch's compiler; otherwise the operations stay single.
         """
         if compiled:
             os.environ[_CACHE_SETTING] = str(cache_folder())
@@ -69,7 +69,7 @@ class Whole:
         self._graphs: dict[Any, Called] = {}
 
     def __call__(self, steps: Any, rates: tuple[float | Tensor, ...]) -> Tensor:
-        """What the function gives; the rates reach it as tensors."""
+        """The result of the function, which gets the rates as tensors."""
         tensors: list[Tensor] = []
         form = _form(steps, tensors, {})
         values = [float(rate) for rate in rates]
@@ -86,10 +86,10 @@ class Whole:
         return self._graphs[form](tensors, values)
 
     def prepare(self, steps: Any, rates: tuple[float | Tensor, ...]) -> None:
-        """Make its graph for arguments of this form; nothing is changed.
+        """Make the graph for arguments of this form; no tensor is changed.
 
         Raises:
-            RunError: the compiler fails, or what it keeps is damaged or cannot be written.
+            RunError: the compiler fails, or its cache is damaged or cannot be written.
         """
         try:
             with self.unchanged():
@@ -99,13 +99,13 @@ class Whole:
                 raise
             why = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
             raise RunError(
-                f"the update cannot be compiled ({why}): empty {cache_folder()} if that was of "
-                "another machine or is damaged, or learn with service.compile=false"
+                f"the update cannot be compiled ({why}): empty {cache_folder()} if it is damaged "
+                "or from another machine, or set service.compile=false"
             ) from error
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """What is changed within is undone."""
+        """Context that restores the changed tensors at its end."""
         before = [one.detach().clone() for one in self._changed]
         try:
             yield
@@ -115,7 +115,7 @@ class Whole:
                     one.copy_(old)
 
     def _built(self, function: Call, tensors: list[Tensor], numbers: list[Tensor]) -> Call:
-        """The same, compiled."""
+        """The function, compiled."""
         # Only here: the compiler takes seconds and 200 MB to load.
         from torch._inductor import standalone_compile  # noqa: PLC0415
         from torch.fx.experimental.proxy_tensor import make_fx  # noqa: PLC0415
@@ -125,17 +125,17 @@ class Whole:
         def flat(*given: Tensor) -> tuple[Tensor]:
             return (function(given[:count], given[count:]),)
 
-        with self.unchanged():  # it is traced by doing it once
+        with self.unchanged():  # tracing executes the function
             graph, constants = _lifted(make_fx(flat)(*tensors, *numbers))
         example: list[Any] = [*constants, *tensors, *numbers]
         patches = {
-            # What calls the compiled pieces one after the other is C++ as well; on a CPU alone.
+            # On a CPU the code that calls the compiled pieces is C++ as well.
             "cpp_wrapper": tensors[0].device.type == "cpu",
-            # Headers compiled ahead lie in /tmp, where others of the machine may put their own.
+            # Precompiled headers lie in /tmp, where other users of the machine may put files.
             "cpp_cache_precompile_headers": False,
         }
         with torch.no_grad(), warnings.catch_warnings():
-            # Ten bits of a product would be quicker on a GPU; a pose needs more.
+            # torch advises its faster ten-bit products; poses need more precision.
             warnings.filterwarnings("ignore", "TensorFloat32")
             compiled = standalone_compile(
                 graph,
@@ -152,9 +152,10 @@ class Whole:
         return call
 
     def _recorded(self, call: Call, tensors: list[Tensor], numbers: list[Tensor]) -> Called:
-        """The same as a CUDA graph, which has places of its own for its arguments.
+        """The function as a CUDA graph, with fixed memory for its arguments.
 
-        As it is where there is no GPU, or where it does what no graph can: wait for a value, say.
+        It stays single operations without a GPU, or if a graph cannot record it: for example, if
+        it waits for a value.
         """
         if not tensors[0].is_cuda:
             return _filled(call)
@@ -166,24 +167,24 @@ class Whole:
         torch._foreach_copy_(given, [*tensors, *numbers])
         graph, aside = torch.cuda.CUDAGraph(), torch.cuda.Stream()  # type: ignore[no-untyped-call]
         with self.unchanged():
-            # What is done at first only must not be recorded, such as the choice of a kernel.
+            # The first call is not recorded: it has one-time work, such as the choice of kernels.
             aside.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(aside):
                 call(own, rates)
             torch.cuda.current_stream().wait_stream(aside)
             try:
-                with (  # the outer one: what fails in the inner one leaves its stream behind
+                with (  # the outer context restores the stream if the inner one fails
                     torch.cuda.stream(torch.cuda.current_stream()),
                     torch.cuda.graph(graph, capture_error_mode="thread_local"),
                 ):
                     found = call(own, rates)
             except RuntimeError as error:
                 why = str(error).partition("\n")[0]
-                log.warning("updates are not recorded, and slow: %s", why)
+                log.warning("updates are slow, as no CUDA graph can record them: %s", why)
                 return _filled(call)
 
         def replay(tensors: list[Tensor], values: list[float], _: Any = call) -> Tensor:
-            # The graph reads its constants where they lie: `call` keeps them.
+            # The default argument keeps `call`, and with it the constants that the graph reads.
             torch._foreach_copy_(own, tensors)
             for rate, value in zip(rates, values, strict=True):
                 rate.fill_(value)
@@ -194,7 +195,7 @@ class Whole:
 
 
 def _filled(call: Call) -> Called:
-    """The same of rates as numbers."""
+    """A call with rates as numbers instead of tensors."""
 
     def filled(tensors: list[Tensor], values: list[float]) -> Tensor:
         device = tensors[0].device
@@ -204,15 +205,15 @@ def _filled(call: Call) -> Called:
 
 
 def _lifted(traced: GraphModule) -> tuple[GraphModule, list[Tensor]]:
-    """A graph of arguments alone, and the tensors to call it with before its own arguments.
+    """A graph whose constants became its first arguments, and the tensors for them.
 
-    Weights and averages are constants in what was traced. As arguments they may change, and the
-    kept code fits those of the next run.
+    Weights and averages are constants in a trace. As arguments they may change, and the compiled
+    code also fits the next run.
     """
     graph, constants, places = traced.graph, [], {}
     first = next(iter(graph.nodes))
     for node in list(graph.nodes):
-        node.meta.clear()  # that of another compilation
+        node.meta.clear()  # metadata of another compilation
         if node.op != "get_attr":
             continue
         if node.target not in places:
@@ -225,7 +226,7 @@ def _lifted(traced: GraphModule) -> tuple[GraphModule, list[Tensor]]:
 
 
 def _form(part: Any, tensors: list[Tensor], seen: dict[int, int]) -> Any:
-    """What two arguments of one graph have in common; their tensors are listed, each once."""
+    """The form of an argument, equal for calls that share a graph; appends each tensor once."""
     if isinstance(part, Tensor):
         if id(part) not in seen:
             seen[id(part)] = len(tensors)
@@ -238,7 +239,7 @@ def _form(part: Any, tensors: list[Tensor], seen: dict[int, int]) -> Any:
 
 
 def _with(part: Any, tensors: dict[int, Tensor], made: dict[int, Any]) -> Any:
-    """The same with other tensors; what was one object stays one."""
+    """A copy with other tensors; an object that occurs twice stays one object."""
     if isinstance(part, Tensor):
         return tensors[id(part)]
     if not is_dataclass(part) or isinstance(part, type):

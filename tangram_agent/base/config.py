@@ -1,4 +1,4 @@
-"""Settings that agents share: of their networks, and of how they learn."""
+"""Shared settings of agents: networks, hindsight and learning."""
 
 from dataclasses import dataclass, field
 
@@ -15,7 +15,7 @@ class NetConfig(Settings, section="net"):
 
     kind: str = setting(
         "mha",
-        "attention network (Eqs. 8-13) or perceptron",
+        "mha: attention network (Eqs. 8-13); mlp: multi-layer perceptron",
         choices=("mha", "mlp"),
     )
     hidden: tuple[int, ...] = setting(
@@ -26,7 +26,10 @@ class NetConfig(Settings, section="net"):
         only={"kind": "mlp"},
     )
     activation: str = setting(
-        "relu", "between the layers", choices=("relu", "tanh"), only={"kind": "mlp"}
+        "relu",
+        "activation function between the layers",
+        choices=("relu", "tanh"),
+        only={"kind": "mlp"},
     )
     width: int = setting(64, "size of a node's embedding", low=1, high=4096, only={"kind": "mha"})
     layers: int = setting(3, "rounds of message passing", low=1, high=64, only={"kind": "mha"})
@@ -44,8 +47,8 @@ class NetConfig(Settings, section="net"):
     )
     init: str = setting(
         "fan_in",
-        "weights are drawn within the root of 1 / inputs; authors: queries, keys and values within "
-        "that of 1 / width of a head, the embedding by Glorot and Bengio (2010) for ReLU",
+        "fan_in: weights are drawn within 1 / sqrt(inputs); authors: queries, keys and values "
+        "within 1 / sqrt(width of a head), the embedding by Glorot and Bengio (2010) for ReLU",
         choices=("fan_in", "authors"),
         only={"kind": "mha"},
     )
@@ -60,19 +63,20 @@ class NetConfig(Settings, section="net"):
 
 @dataclass(frozen=True)
 class RelabelConfig(Settings, section="agent.hindsight"):
-    """One kind of other goal that transitions are learned with besides the one that was played."""
+    """One kind of hindsight goal, with which transitions are learned besides the played goal."""
 
     strategy: str = field(
         metadata=declared(
-            "the goal: final, future or near (the final pose moved by Gaussian noise); "
-            "pairs of several tokens: where the token came to lie by its action is final",
+            "final: the state at the end of the episode; future: a random later state; near: the "
+            "final poses with Gaussian noise; with several tokens agent=pair uses the pose after "
+            "the action as final",
             choices=STRATEGIES,
         )
     )
     copies: int = setting(1, "goals of this kind for each transition", low=1, high=64)
     position: float = setting(
         0.0,
-        "deviation of the goal's shift",
+        "standard deviation of the goal's shift",
         low=0,
         high=1e3,
         unit="arena units",
@@ -80,7 +84,7 @@ class RelabelConfig(Settings, section="agent.hindsight"):
     )
     angle: float = setting(
         0.0,
-        "deviation of the goal's turn",
+        "standard deviation of the goal's turn",
         low=0,
         high=100,
         unit="rad",
@@ -90,12 +94,12 @@ class RelabelConfig(Settings, section="agent.hindsight"):
 
 @dataclass(frozen=True)
 class LearningConfig(Settings, section="agent"):
-    """What whoever learns from a replay by gradients is told."""
+    """Settings of gradient learning from a replay buffer."""
 
     name: str = setting("tangram", "the preset's name, for reports", part=LEARNING)
     acting_average: float = setting(
         0.99,
-        "Polyak average of the weights that play and are scored; 0: none",
+        "rho of the Polyak average of the weights that play and are scored; 0: no average",
         low=0,
         high=1,
         part=LEARNING,
@@ -105,14 +109,19 @@ class LearningConfig(Settings, section="agent"):
     )
     lr_final: float = setting(
         0.01,
-        "share of the learning rates that their cosine over the run's budget ends at; 1: no decay",
+        "share of the learning rates at the end of the budget; they fall along a cosine; 1: no "
+        "decay",
         low=0,
         high=1,
         part=LEARNING,
     )
     batch_size: int = setting(64, "transitions in one update", low=1, part=LEARNING)
     replay_capacity: int = setting(
-        200_000, "transitions kept", low=1, high=1_000_000_000, part=LEARNING
+        200_000,
+        "transitions kept in the replay buffer",
+        low=1,
+        high=1_000_000_000,
+        part=LEARNING,
     )
     updates_per_transition: float = setting(
         0.1, "updates for each transition played", low=1e-9, high=1e3, part=LEARNING
@@ -138,17 +147,17 @@ class LearningConfig(Settings, section="agent"):
 
 @dataclass(frozen=True)
 class ActorCriticConfig(LearningConfig, section="agent"):
-    """DDPG and hindsight."""
+    """Settings of DDPG with hindsight."""
 
     saturation_penalty: float = setting(
         1.0,
-        "weight in the actor's loss of squared pre-activations",
+        "weight of squared pre-activations in the actor's loss",
         low=0,
         part=LEARNING,
     )
     gamma: float = setting(
         0.0,
-        "discount, Eq. 5; one action in an episode leaves nothing to discount",
+        "discount factor, Eq. 5; without effect in episodes of one action",
         low=0,
         high=1,
         part=LEARNING,
@@ -165,15 +174,18 @@ class ActorCriticConfig(LearningConfig, section="agent"):
         1e-3, "the actor's learning rate at the start", low=1e-9, high=1e3, part=LEARNING
     )
     noise: float = setting(
-        0.05, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
+        0.05,
+        "standard deviation of the Gaussian exploration noise on actions",
+        low=0,
+        part=LEARNING,
     )
-    # With one action every plain relabel scores +1, so only near misses teach the slope.
+    # With one action every exact relabel scores +1: only near misses show how rewards fall.
     hindsight: tuple[RelabelConfig, ...] = setting(
         (
             RelabelConfig("final"),
             RelabelConfig("near", position=0.1, angle=0.5),
             RelabelConfig("near", position=0.02, angle=0.1),
         ),
-        "the other goals that every transition is learned with; []: none",
+        "hindsight goals with which every transition is learned, too; []: none",
         part=LEARNING,
     )

@@ -1,6 +1,6 @@
 """Deep deterministic policy gradient, Eqs. 3-6, with hindsight.
 
-Legend: M views.
+Legend: M views. A view is what networks see at once: a whole scene, or a pair of token and piece.
 """
 
 from abc import abstractmethod
@@ -25,19 +25,18 @@ from tangram_tasks.place import Place
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """A batch as both losses see it; what a view is, the agent's own networks know.
+    """A batch for both losses; the type of its views depends on the agent.
 
     Attributes:
-        view: where the action was taken.
-        velocity: (M, 3) of the action, in the arena's axes.
-        reward: (M,) what the critic learns, less what follows.
-        done: (M,) 1 where nothing follows.
-        start: where the actor is asked from: mostly the same view.
-        follow: what the action came to.
-            None where nothing follows on any of them.
-        seen_after: that too where an afterstate critic is to see it as it was, else it sees the
-            exact motion.
-        acts: whether the actor moves.
+        view: the views in which the actions were taken.
+        velocity: (M, 3) velocities of the actions, in the arena's axes.
+        reward: (M,) the critic's target without the value of the next view.
+        done: (M,) 1 where the target does not count the next view.
+        start: the views for which the actor proposes velocities, mostly equal to `view`.
+        follow: the next views; None if `done` is 1 everywhere.
+        seen_after: the views after the actions, for a critic of afterstates; None: that critic
+            computes the exact motion.
+        acts: whether the update changes the actor.
     """
 
     view: Any
@@ -51,16 +50,16 @@ class Steps:
 
 
 class Ddpg(TokenLearner):
-    """Actor and critic on views of tokens; an agent says what these are.
+    """DDPG learner of an actor and a critic; a subclass turns transitions into views.
 
     Attributes:
-        bootstraps: whether the critic's target counts what follows (Eq. 5): only then are there
-            target networks.
-        relabels: the goals of hindsight that transitions are kept with.
+        bootstraps: whether the critic's target counts the next view (Eq. 5). Only then target
+            networks exist.
+        relabels: kinds of hindsight goals with which transitions enter the replay buffer.
     """
 
     advice = "lower agent.actor_lr and agent.critic_lr"
-    limit = 0.0  # of pre-activations, beyond which they pay a penalty
+    limit = 0.0  # pre-activations beyond it cost a penalty
     replay: ReplayBuffer
 
     def __init__(
@@ -72,14 +71,14 @@ class Ddpg(TokenLearner):
         device: str,
         compiled: bool,
     ) -> None:
-        """Networks with the weights of a seed.
+        """Initialise the networks from a seed and make an empty replay buffer.
 
         Args:
-            task: what is played.
-            config: the agent's.
-            networks: actor, critic, and what is played with.
-            seed: of the weights.
-            device: where it learns.
+            task: the task.
+            config: the agent's settings.
+            networks: the actor, the critic, and the network that plays.
+            seed: seed of the weights.
+            device: torch device for learning.
             compiled: whether an update is compiled as a whole, see `Whole`.
         """
         self.task, self.config, self.polyak = task, config, config.polyak
@@ -96,15 +95,15 @@ class Ddpg(TokenLearner):
 
     @abstractmethod
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:
-        """What the losses see of a batch; what hindsight draws anew, it draws here."""
+        """Turn a batch into views for the losses; `generator` draws new hindsight goals."""
 
     def rates(self, share: float) -> Rates:
-        """Of the next update, at a used share of the budget."""
+        """Rates of the next update, at a used share of the budget."""
         actor = self.config.actor_lr * self.rate_factor(share)
         return super().rates(share)._replace(actor=actor)
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:
-        """Keep transitions as they were played, and relabelled."""
+        """Add the played and the relabelled transitions to the replay buffer."""
         seen, task = learnable(episodes), self.task
         if seen.count:
             relabelled = self.relabels, task.layout, task.reward_of, rng["hindsight"]
@@ -112,12 +111,12 @@ class Ddpg(TokenLearner):
         return seen.transitions
 
     def drawn(self, rng: Streams) -> Steps:
-        """What the losses see of transitions of the replay."""
+        """Draw a batch from the replay buffer and turn it into views."""
         self.batch = self.replay.sample(self.config.batch_size, rng["replay"])
         return self.steps(self.batch, rng["hindsight"])
 
     def losses(self, seen: Steps) -> Iterator[Loss]:
-        """The critic's, Eq. 3, then the actor's, Eq. 6: minus the value of its own actions."""
+        """Yield the losses of the critic, Eq. 3, and the actor, Eq. 6: minus its actions' value."""
         features = self.features(seen)
         with torch.no_grad():
             y = self._target(seen)
@@ -127,19 +126,19 @@ class Ddpg(TokenLearner):
             return
         velocity, raw = self.actor(seen.start, features)
         value = -self.critic(seen.start, velocity, None, features).mean()
-        # Keeps tanh or clamp from going flat.
+        # Keeps tanh or clamp out of their flat ranges.
         saturation = torch.relu(raw.abs() - self.limit).square().mean()
         total = value + self.config.saturation_penalty * saturation
         yield Loss("actor", total, {"actor_loss": value, "saturation": saturation})
 
     def features(self, steps: Steps) -> Tensor | None:  # noqa: ARG002
-        """What actor and critic both see, made once; None where they see different things."""
+        """Network inputs that actor and critic share; None if their inputs differ."""
         return None
 
     def _target(self, steps: Steps) -> Tensor:
-        """Y of Eq. 5, (M,); the target networks are not asked where no transition goes on.
+        """Targets (M,), y of Eq. 5; without next views the target networks are not evaluated.
 
-        The paper's equation lacks (1 - d), but after the end of an episode nothing can follow.
+        The paper's equation lacks the factor (1 - d), but a terminal state has no value.
         """
         if steps.follow is None:
             return steps.reward
@@ -148,7 +147,7 @@ class Ddpg(TokenLearner):
         return steps.reward + self.config.gamma * (1.0 - steps.done) * following
 
     def blanks(self) -> Iterator[Steps]:
-        """Some go on in nearly every batch of those that bootstrap; none elsewhere."""
+        """Example batches to compile for; they have next views if the learner bootstraps."""
         size = self.config.batch_size
         columns = {name: array[:size] for name, array in self.replay.arrays.items()}
         columns["done"] = np.full(size, not self.bootstraps, np.uint8)
@@ -157,5 +156,5 @@ class Ddpg(TokenLearner):
             yield replace(seen, acts=acts)
 
     def if_any_follows(self, done: npt.NDArray[Any], follow: Any) -> Any:
-        """What follows, where a target network is to be asked of it; else None."""
+        """The next views if the critic's target counts any of them, else None."""
         return follow if self.bootstraps and not done.all() else None

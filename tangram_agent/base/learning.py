@@ -1,4 +1,4 @@
-"""What all learners by gradients share: networks, their targets, optimisers and state."""
+"""Base classes of gradient learners: networks, target networks, optimisers and state."""
 
 import copy
 import math
@@ -24,7 +24,7 @@ _COUNTER = "updates"
 
 
 class Rates(NamedTuple):
-    """Learning rates of an update, and how much the running average keeps; tensors in a graph."""
+    """Learning rates of an update, and rho of the running average; tensors inside a graph."""
 
     actor: float | Tensor
     critic: float | Tensor
@@ -33,12 +33,12 @@ class Rates(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """What one network is to make small.
+    """The loss of one network.
 
     Attributes:
         part: the network's name in `NetworkLearner.parts`.
-        value: () whatever it depends on, only this network moves.
-        told: numbers () for the curves.
+        value: () the loss; its gradient changes only this network.
+        told: further numbers () for the curves, by name.
     """
 
     part: str
@@ -47,7 +47,7 @@ class Loss:
 
 
 class Replay(Protocol):
-    """What a learner keeps, to a checkpoint and back."""
+    """A replay buffer that a checkpoint can save and load."""
 
     def __len__(self) -> int: ...
     def state(self) -> dict[str, Array]: ...  # noqa: D102
@@ -55,19 +55,19 @@ class Replay(Protocol):
 
 
 class NetworkLearner(Learner):
-    """Networks that learn by their losses, and target networks that follow them slowly.
+    """Learner of networks by their losses, with target networks that follow slowly.
 
     Attributes:
         polyak: rho of the target networks, Eq. 4.
-        delay: the actor moves in every so manieth update.
-        compiles: whether its updates can be made a graph, by a compiler or by a GPU.
-        replay: what it learns from.
-        batch: of the last update, with `arrays`.
-        targets: frozen copies of networks, by the names of these.
-        parts: all networks, by the names under which a checkpoint has them.
-        lists: their parameters. Walking modules would take a fifth of a small network's update.
-        optimisers: of the networks that learn, by their names in `parts`.
-        names: of the numbers of an update in which the actor moves, and of one in which it rests.
+        delay: updates for each update of the actor.
+        compiles: whether updates may become graphs, by the compiler or on a GPU.
+        replay: the replay buffer.
+        batch: the batch of the last update; it has `arrays`.
+        targets: target networks, by the names of the networks that they follow.
+        parts: all networks, by their names in a checkpoint.
+        lists: parameters of each network: collecting them takes a fifth of a small update.
+        optimisers: optimisers of the learned networks, by their names in `parts`.
+        names: names of an update's numbers: True with a step of the actor, False without.
     """
 
     compiles = True
@@ -85,15 +85,15 @@ class NetworkLearner(Learner):
         compiled: bool = False,
         others: Mapping[str, nn.Module] | None = None,
     ) -> None:
-        """Take networks as they are.
+        """Take networks with their present weights.
 
         Args:
             learned: networks that are learned by gradients, by name.
-            targets: names of those that have a target network.
-            device: where it learns.
+            targets: names of learned networks that have a target network.
+            device: torch device for learning.
             compiled: whether an update is compiled as a whole, see `Whole`; on a GPU it is
                 recorded in any case.
-            others: networks that are fitted otherwise.
+            others: networks that change in other ways than by gradients, by name.
         """
         for name in targets:
             if name not in learned:
@@ -117,22 +117,22 @@ class NetworkLearner(Learner):
             changed = [one for own in (*self.lists.values(), *slots) for one in own]
             self._whole = Whole(self.step, changed, compiled)
 
-    # What a learner of its own says
+    # For subclasses
 
     @abstractmethod
     def drawn(self, rng: Streams) -> Any:
-        """What an update learns from, as `losses` takes it; all that is random is drawn here."""
+        """Draw the batch of an update for `losses`; all random numbers are drawn here."""
 
     @abstractmethod
     def losses(self, seen: Any) -> Iterator[Loss]:
-        """Yield a network's loss; it makes its step before the next one is asked for."""
+        """Yield each network's loss; the network makes its step before the next is computed."""
 
     @abstractmethod
     def rates(self, share: float) -> Rates:
-        """Of the next update, at a used share of the budget."""
+        """Rates of the next update, at a used share of the budget."""
 
     def blanks(self) -> Iterator[Any]:
-        """What `losses` may see, one of each form, with whatever in it: to compile for it."""
+        """Example batches to compile for, one of each form that `losses` may get."""
         yield from ()
 
     def follow(self, rates: Rates) -> None:  # noqa: ARG002
@@ -143,23 +143,23 @@ class NetworkLearner(Learner):
     # Updates
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
-        """See `Learner.update`; its numbers are those of `learn`."""
+        """See `Learner.update`; the numbers are those of `learn`."""
         return self.learn(self.drawn(rng), share)
 
     def learn(self, seen: Any, share: float = 0.0) -> dict[str, float]:
-        """One step of all networks.
+        """Make one step of all networks.
 
         Args:
-            seen: what the losses see.
-            share: of the run's budget that is used, in [0, 1]; decides the learning rate.
+            seen: a batch from `drawn`.
+            share: used share of the run's budget, in [0, 1]; sets the learning rates.
 
         Returns:
-            Of each network NAME_loss and NAME_gradient, its norm, and what its loss tells.
+            NAME_loss and NAME_gradient (the norm) of each network, and what its loss told.
 
         Raises:
-            NotFiniteError: one of these is not finite.
+            NotFiniteError: one of the numbers is not finite.
         """
-        found = self._whole(seen, self.rates(share))  # the one wait for the device is below
+        found = self._whole(seen, self.rates(share))  # only tolist() below waits for it
         names = self.names[getattr(seen, "acts", True)]
         numbers = dict(zip(names, found.tolist(), strict=True))
         if not all(map(math.isfinite, numbers.values())):
@@ -169,7 +169,7 @@ class NetworkLearner(Learner):
         return numbers
 
     def step(self, seen: Any, rates: Rates) -> Tensor:
-        """The whole update, on the device alone; its numbers, by their names in `names`."""
+        """Make the whole update on the device; returns its numbers in the order of `names`."""
         numbers: dict[str, Tensor] = {}
         for loss in self.losses(seen):
             self._check(loss)
@@ -184,7 +184,7 @@ class NetworkLearner(Learner):
         return torch.stack([one.detach() for one in numbers.values()])
 
     def _check(self, loss: Loss) -> None:
-        """Refuse a loss of no network, or what is no single number."""
+        """Refuse a loss of an unknown network, or a value that is not a single number."""
         if loss.part not in self.optimisers:
             known = ", ".join(self.optimisers)
             self.refuse("losses", f"a Loss of '{loss.part}'", f"one of {known}")
@@ -193,53 +193,53 @@ class NetworkLearner(Learner):
                 self.refuse("losses", f"{name} of shape {tuple(value.shape)}", "a single number")
 
     def refuse(self, method: str, came: str, wanted: str) -> NoReturn:
-        """Tell who wrote the learner what a method of it must not give."""
+        """Raise ConfigError for a wrong result of a subclass's method."""
         raise ConfigError(f"{type(self).__name__}.{method}: wanted {wanted}, got {came}")
 
     def prepare(self) -> None:
-        """Make graphs of updates: compiled, the first ones would take a minute."""
+        """Make the graphs of updates ahead of time: to compile them may take a minute."""
         if isinstance(self._whole, Whole):
             for seen in self.blanks():
                 self._whole.prepare(seen, self.rates(0.0))
                 self._check_steady(self._whole, seen)
 
     def _check_steady(self, whole: Whole, seen: Any) -> None:
-        """Refuse losses that hang on how many updates were made: a graph has them as they were."""
+        """Refuse losses that depend on the number of updates: a graph would keep the first one."""
         made, rates, numbers = self.updates, self.rates(0.0), list[Tensor]()
         for self.updates in (made, made + 10**6):
             with whole.unchanged():
                 numbers.append(self.step(seen, rates))
         self.updates = made
         if not torch.allclose(numbers[0], numbers[1], rtol=1e-2, atol=1e-5, equal_nan=True):
-            wanted = "the same of the same batch, so that a GPU or a compiler may repeat them"
-            came = "others after more updates: draw what changes with the batch, or set compiles"
+            wanted = "equal losses of equal batches, which a GPU or a compiler can repeat"
+            came = "other losses after more updates: move what changes to drawn(), or set compiles"
             self.refuse("losses", f"{came} = False in the class", wanted)
 
     def tensor(self, array: Array, dtype: type = np.float32) -> Tensor:
-        """On the device, in single precision where no other type is said."""
+        """A tensor of an array, on the device."""
         return torch.from_numpy(np.asarray(array, dtype)).to(self.place)
 
     # State
 
     @property
     def kept(self) -> int:
-        """How much there is in the replay."""
+        """Number of entries in the replay buffer."""
         return len(self.replay)
 
     def memory(self) -> dict[str, Array]:
-        """The replay."""
+        """The replay buffer, for a checkpoint."""
         return self.replay.state()
 
     def load_memory(self, memory: Mapping[str, Array]) -> None:
-        """Take over a replay."""
+        """Load a replay buffer from a checkpoint."""
         self.replay.load_state(memory)
 
     def evidence(self) -> Arrays:
-        """The batch of the last update."""
+        """Arrays of the last update's batch, by name."""
         return {} if self.batch is None else self.batch.arrays
 
     def state(self) -> dict[str, Array]:
-        """Everything but the replay that the next update depends on."""
+        """Networks, optimisers and the number of updates, for a checkpoint."""
         state: dict[str, Array] = {_COUNTER: np.array([self.updates], np.int64)}
         for part, module in self.parts.items():
             state |= {f"{part}.{name}": value for name, value in to_arrays(module).items()}
@@ -250,13 +250,13 @@ class NetworkLearner(Learner):
         return state
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state from `state()`.
+        """Load a state from `state()`.
 
         Raises:
             RunError: tensors are missing or have other shapes: another layout or another net.
         """
         if _COUNTER not in state:
-            raise RunError("learner state: no counter of updates: not a learner's checkpoint")
+            raise RunError("the learner's state has no number of updates: take another checkpoint")
         self.load_networks(state)
         for part, optimiser in self.optimisers.items():
             content: dict[str, dict[int, Tensor]] = {}
@@ -268,7 +268,7 @@ class NetworkLearner(Learner):
         self.updates = int(state[_COUNTER][0])
 
     def load_networks(self, state: Mapping[str, Array]) -> None:
-        """Take over the networks of a state, and nothing else.
+        """Load only the networks of a state.
 
         Raises:
             RunError: tensors are missing or have other shapes.
@@ -277,15 +277,15 @@ class NetworkLearner(Learner):
             load_arrays(module, under(f"{part}.", state))
 
     def begin_with(self, state: Mapping[str, Array]) -> None:
-        """Take over the networks of another run, and learn on with new optimisers."""
+        """Load the networks of another run; the optimisers start anew."""
         self.load_networks(state)
 
 
 class TokenLearner(NetworkLearner):
-    """Learns what an agent of tokens plays: a running average of its networks.
+    """Learner of an agent of tokens, which plays with a running average of its networks.
 
     Attributes:
-        acting: the average, of which workers get what they need.
+        acting: the running average, which workers get.
     """
 
     advice = "lower agent.critic_lr"
@@ -301,14 +301,14 @@ class TokenLearner(NetworkLearner):
         targets: Iterable[str] = (),
         compiled: bool = False,
     ) -> None:
-        """Networks with the weights of a seed.
+        """Initialise the networks from a seed.
 
         Args:
-            config: rates and averages.
-            learned: see `NetworkLearner`, as are those that are not named here.
-            playing: what is played with, made of these and of others.
-            seed: of the weights.
-            device: where it learns.
+            config: settings of learning rates and averages.
+            learned: see `NetworkLearner`, also for arguments that are not listed here.
+            playing: the network that plays, made of learned networks; `acting` averages it.
+            seed: seed of the weights.
+            device: torch device for learning.
         """
         generator = torch.Generator().manual_seed(seed)
         for network in learned.values():
@@ -320,40 +320,40 @@ class TokenLearner(NetworkLearner):
         self.lists["playing"] = list(playing.parameters())
 
     def follow(self, rates: Rates) -> None:
-        """Move the running average, too."""
+        """Update the target networks and the running average."""
         super().follow(rates)
         polyak_update(self.lists["acting"], self.lists["playing"], rates.kept)
 
     def rate_factor(self, share: float) -> float:
-        """By which learning rates have fallen at a used share of the budget: along a cosine."""
+        """Factor of the learning rates at a used share of the budget; it falls along a cosine."""
         used, low = min(max(share, 0.0), 1.0), self._rates_of.lr_final
         return low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * used))
 
     def rates(self, share: float) -> Rates:
-        """Of the next update, at a used share of the budget."""
+        """Rates of the next update, at a used share of the budget."""
         rate = self._rates_of.critic_lr * self.rate_factor(share)
-        # A constant 0.99 would hold the random weights of the start for hundreds of updates.
+        # A constant 0.99 would keep the random first weights for hundreds of updates.
         kept = min(self._rates_of.acting_average, self.updates / (self.updates + 9.0))
         return Rates(rate, rate, kept)
 
     def export(self) -> Tensors:
-        """A copy of the weights to play with, as a checkpoint keeps them."""
+        """A copy of the averaged weights, for a checkpoint."""
         return to_arrays(self.acting)
 
     def broadcast(self) -> Tensors:
-        """Those of them that workers need."""
+        """The averaged weights that workers need."""
         return self.export()
 
 
 def frozen(module: nn.Module) -> nn.Module:
-    """A copy that no gradient reaches."""
+    """A copy of a module whose parameters need no gradients."""
     return copy.deepcopy(module).requires_grad_(False)
 
 
 def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float | Tensor) -> None:
     """Eq. 4: target <- rho * target + (1 - rho) * source, parameter by parameter."""
     with torch.no_grad():
-        if isinstance(rho, Tensor):  # of a graph
+        if isinstance(rho, Tensor):  # inside a graph
             for target, source in zip(targets, sources, strict=True):
                 target.lerp_(source, 1.0 - rho)
         else:
@@ -363,8 +363,8 @@ def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float | Ten
 def gradient_norm(gradients: Sequence[Tensor], traced: bool) -> Tensor:
     """The norm of all gradients together, ().
 
-    torch's own is one kernel for all of them, which compiled code cannot call directly: what is
-    traced is told in single operations.
+    torch's own norm is one kernel, which compiled code cannot call directly. A traced update uses
+    single operations instead.
     """
     if not traced:
         return nn.utils.get_total_norm(gradients)

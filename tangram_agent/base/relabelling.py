@@ -1,8 +1,8 @@
 """Hindsight experience replay (Sec. III-B): transitions with the goals that they reached.
 
-Where the critic learns the environment's reward, relabelled transitions are made once, when
-episodes go into the replay. With several tokens on pairs it learns what a token covers of one piece
-of the target, which is known for any goal: there goals are made anew for every update and pair.
+If the critic learns the environment's reward, transitions are relabelled once, when episodes enter
+the replay buffer. With agent=pair and several tokens the critic learns the area that a token covers
+of one piece. That is known for any goal, so each update draws new goals for its pairs.
 
 Legend: E episodes, T steps, B = E * T transitions, P pairs of each, M = B * P, K tokens, V corners.
 """
@@ -22,10 +22,10 @@ RewardFunction = Callable[[Floats, Floats], Floats]
 
 
 def learnable(episodes: Episodes) -> Episodes:
-    """Those in which all tokens and pieces were seen at all times.
+    """The episodes in which all tokens and pieces were seen at all times.
 
-    To lose an episode of many actions for one token that left the picture would be worse than to
-    learn from where it was told to go.
+    With several tokens, one that left the picture counts as seen where it was told to go: that is
+    better than to lose an episode of many actions.
     """
     if "seen" not in episodes.arrays:
         return episodes
@@ -34,7 +34,7 @@ def learnable(episodes: Episodes) -> Episodes:
 
 
 def flatten(episodes: Episodes) -> Transitions:
-    """The transitions as they were played, episode after episode."""
+    """The played transitions, one episode after the other."""
     size = episodes.count * episodes.steps
     corners, placed = episodes["corners"], episodes["placed"]
     return Transitions(
@@ -56,7 +56,7 @@ def with_relabelled(
     reward: RewardFunction,
     generator: np.random.Generator,
 ) -> Transitions:
-    """The transitions played, followed by those with every other goal, rewarded for it."""
+    """The played transitions, followed by copies with each hindsight goal and its reward."""
     played = flatten(episodes)
     goals = [
         _goals(episodes, relabel, layout, generator)
@@ -65,7 +65,7 @@ def with_relabelled(
     ]
     if not goals:
         return played
-    # The rewards for all goals at once: each call costs about as much as a hundred of them.
+    # One call for all goals: each call costs about as much as a hundred rewards.
     achieved = np.concatenate([played.next_state] * len(goals)).astype(np.float64)
     rewards = reward(achieved, np.concatenate(goals).astype(np.float64)).astype(np.float32)
     every = {n: np.concatenate([part] * (1 + len(goals))) for n, part in played.arrays.items()}
@@ -75,7 +75,7 @@ def with_relabelled(
 
 
 def spread(relabel: RelabelConfig) -> tuple[float, float, float]:
-    """Standard deviations of a goal's shift and turn."""
+    """Standard deviations of a goal's x, y and angle."""
     return relabel.position, relabel.position, relabel.angle
 
 
@@ -85,8 +85,8 @@ def _goals(
     """Goals (B, V, 2) of one kind.
 
     final: the state in which the episode ended (the paper). future: a state reached at this step
-    or later, drawn uniformly. near: the final poses, each moved a little; with one action per
-    episode every plain goal scores the most there is, so only near misses teach the slope.
+    or later, drawn uniformly. near: the final poses with noise; with one action per episode every
+    exact goal has the highest reward, so only near misses show how it falls.
     """
     count, steps = episodes.count, episodes.steps
     if relabel.strategy == "future":

@@ -10,13 +10,13 @@ class ReplayBuffer(Ring):
     """Keeps the newest `capacity` transitions; sampling is uniform with replacement."""
 
     def __init__(self, capacity: int, corners: int, tokens: int, action_size: int) -> None:
-        """Allocate everything at once.
+        """Allocate all arrays at once.
 
         Args:
-            capacity: transitions kept.
-            corners: V.
-            tokens: K.
-            action_size: A.
+            capacity: most transitions kept.
+            corners: V, corners of all tokens together.
+            tokens: K, number of tokens.
+            action_size: A, entries of an action.
         """
 
         def numbers(*shape: int) -> Column:
@@ -39,7 +39,7 @@ class ReplayBuffer(Ring):
         )
 
     def add(self, batch: Transitions) -> None:
-        """Append a batch; the oldest transitions make room."""
+        """Append a batch and drop the oldest transitions beyond the capacity."""
         self.append(batch.arrays)
 
     def sample(self, size: int, generator: np.random.Generator) -> Transitions:

@@ -1,4 +1,4 @@
-"""What replays are made of: a ring over preallocated arrays."""
+"""A ring buffer over preallocated arrays, the base of all replay buffers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class Column:
 
     Attributes:
         array: (capacity, ...) with room for all rows.
-        low, high: bounds of its numbers, which a checkpoint must keep.
+        low, high: bounds of its numbers; a checkpoint beyond them is refused.
     """
 
     array: Array
@@ -27,31 +27,31 @@ class Column:
 
 
 class Ring:
-    """Keeps the newest rows of some columns; rows are drawn uniformly with replacement.
+    """A ring buffer of rows in several columns; rows are drawn uniformly with replacement.
 
     Attributes:
         arrays: the columns, by name.
-        capacity: rows kept.
+        capacity: most rows kept.
         added: rows ever added; the next one goes to slot `added % capacity`.
     """
 
     def __init__(self, columns: Mapping[str, Column], counter: str = "added") -> None:
-        """Take columns with room for all rows, and the name that a state has the counter by."""
+        """Take columns with room for all rows; `counter` names the counter in a state."""
         self.arrays = {name: column.array for name, column in columns.items()}
         self.capacity, self.added = min(map(len, self.arrays.values())), 0
-        self._lost = 0  # rows that were added and not taken over with a state
+        self._lost = 0  # rows in `added` that a loaded state did not bring
         self._columns, self._counter = columns, counter
 
     def __len__(self) -> int:
         return min(self.added - self._lost, self.capacity)
 
     def _slots(self) -> Ints:
-        """Where the kept rows lie, the oldest first."""
+        """Slots of the kept rows, the oldest first."""
         kept = len(self)
         return (self.added - kept + np.arange(kept)) % self.capacity
 
     def append(self, rows: Mapping[str, Array]) -> Ints:
-        """Add rows to all columns; the oldest make room. Where those lie that are kept."""
+        """Append rows to all columns and drop the oldest; returns the slots of the new rows."""
         count = min(len(rows[name]) for name in self.arrays)
         kept = min(count, self.capacity)
         slots = (self.added + count - kept + np.arange(kept)) % self.capacity
@@ -61,10 +61,10 @@ class Ring:
         return slots
 
     def drawn(self, size: int, generator: np.random.Generator) -> Ints:
-        """Where `size` rows lie.
+        """Slots of `size` rows, drawn uniformly with replacement.
 
         Raises:
-            ValueError: there are none.
+            ValueError: the buffer is empty.
         """
         if not len(self):
             raise ValueError("cannot sample from an empty replay")
@@ -74,20 +74,20 @@ class Ring:
     def state(self) -> dict[str, Array]:
         """The kept rows (mostly views) and the counter.
 
-        Row n that was ever added lies at n modulo the number of those kept.
+        The n-th row since the start has the index n modulo the number of kept rows.
         """
         kept = len(self)
         rows: slice | Ints = slice(kept)
-        if kept < self.capacity and self._lost:  # a full ring that was given more room
+        if kept < self.capacity and self._lost:  # loaded from a full ring with less room
             rows = np.roll(self._slots(), self.added % kept)
         arrays = {name: array[rows] for name, array in self.arrays.items()}
         return arrays | {self._counter: np.array([self.added], np.int64)}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state; of more rows than there is room for, the newest.
+        """Load a state; if it has too many rows, only the newest.
 
         Raises:
-            RunError: columns are missing, of another shape or type, or beyond their bounds.
+            RunError: columns are missing, have another shape or type, or exceed their bounds.
         """
         self.check_valid(state)
         added, kept = int(state[self._counter][0]), len(state[next(iter(self.arrays))])
@@ -98,7 +98,7 @@ class Ring:
             array[slots] = state[name][order]
 
     def check_valid(self, state: Mapping[str, Array] | None = None) -> None:
-        """Raise RunError unless all is as it can be in this ring, or in a state of it."""
+        """Raise RunError if columns of the ring, or of a state, have wrong shapes or numbers."""
         found = self.state() if state is None else state
         added = int(found[self._counter][0]) if self._counter in found else -1
         kept = len(found.get(next(iter(self.arrays)), ()))
@@ -109,10 +109,10 @@ class Ring:
                 or part.shape != (kept, *wanted.shape[1:])
                 or part.dtype != wanted.dtype
                 or added < kept
-                or not ((column.low <= part) & (part <= column.high)).all()  # nor is a NaN
+                or not ((column.low <= part) & (part <= column.high)).all()  # NaN fails, too
             ):
                 raise RunError(
                     f"replay state: '{name}' must be {wanted.dtype} {(kept, *wanted.shape[1:])} "
-                    f"within {column.low:g} and {column.high:g}: it is of another "
-                    "task or another version, or damaged: start a new run"
+                    f"within {column.low:g} and {column.high:g}: it belongs to another "
+                    "task or version, or is damaged: start a new run"
                 )

@@ -1,4 +1,4 @@
-"""What travels between play and learning: small immutable tuples of arrays.
+"""Data classes of arrays that play and learning exchange.
 
 Legend: E episodes, T steps of an episode, B batch, K tokens, V corners of all tokens together,
 A entries of an action (3 for one token: x, y and angular velocity; `tangram_sim.motion.actions`).
@@ -18,12 +18,12 @@ Flags = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What B environments play.
+    """Chosen moves in B environments.
 
     Attributes:
-        token: (B,) which token.
-        flip: (B,) whether it is turned over.
-        velocity: (B, 3) in [-1, 1], the command that takes it where it is to go.
+        token: (B,) index of the token that moves.
+        flip: (B,) whether the token is turned over.
+        velocity: (B, 3) in [-1, 1], takes the token to its chosen pose.
     """
 
     token: Ints
@@ -33,11 +33,11 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """A flat batch of (s, a, r, s', d, g).
+    """A flat batch of transitions (s, a, r, s', d, g).
 
     Attributes:
         state, next_state: (B, V, 2) float32 token corners.
-        placed, next_placed: (B, K) uint8.
+        placed, next_placed: (B, K) uint8, 1 where a token is placed.
         action: (B, A) float32.
         reward: (B,) float32.
         done: (B,) uint8, 1 where next_state is terminal; a time limit is not.
@@ -55,10 +55,10 @@ class Transitions:
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """All of them, by name."""
+        """The arrays, by name."""
         return dict(vars(self))
 
     @property
     def count(self) -> int:
-        """B."""
+        """B, the number of transitions."""
         return len(self.state)

@@ -1,4 +1,4 @@
-"""What learners with an actor and critics share: all but their networks and losses.
+"""Base class of learners with an actor and critics: all but their networks and losses.
 
 Legend: B transitions, F entries of a row, A entries of an action, N draws.
 """
@@ -30,17 +30,17 @@ Config = TypeVar("Config", bound=BaseConfig)
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What the losses see, on the device.
+    """A batch for the losses, on the device.
 
     Attributes:
-        rows: (B, F) where the action was taken; the goal is in them.
+        rows: (B, F) inputs before the action, the goal included.
         actions: (B, A).
         rewards: (B,).
-        goes_on: (B,) 1 where what follows counts, 0 where the step terminated.
-        following: (B, F) what the action came to.
-        normals: (N, B, A) drawn from a standard normal: losses draw nothing themselves, so that
-            they can be compiled, and a run that is resumed goes on exactly.
-        acts: whether this update moves the actor.
+        goes_on: (B,) 0 where the step terminated, else 1.
+        following: (B, F) inputs after the action, the goal included.
+        normals: (N, B, A) standard normals. Losses must draw nothing themselves: so they can be
+            compiled, and a resumed run goes on exactly.
+        acts: whether this update changes the actor.
     """
 
     rows: Tensor
@@ -53,13 +53,13 @@ class Batch:
 
     @property
     def arrays(self) -> Arrays:
-        """All of it, by name."""
+        """The arrays of the batch, by name."""
         tensors = {name: one for name, one in vars(self).items() if isinstance(one, Tensor)}
         return {name: one.cpu().numpy() for name, one in tensors.items()}
 
 
 class ActorCritic(NetworkLearner, Generic[Config]):
-    """Extend it with `modules` and `losses`.
+    """Learner of an actor and critics; a subclass adds `modules` and `losses`.
 
     Attributes:
         draws: N, standard normals that the losses need for each entry of an action.
@@ -79,7 +79,7 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         device: str = "cpu",
         compiled: bool = False,
     ) -> None:
-        """Networks with the weights of a seed, and an empty replay."""
+        """Initialise the networks from a seed and make an empty replay buffer."""
         self.config: Config = agent.config  # type: ignore[assignment]  # the agent's own class of it
         self.polyak = self.config.polyak
         self._task, self._inputs = task, Inputs(task.spec)
@@ -87,51 +87,51 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         self._normaliser = Normaliser(self.size)
         self.replay = EpisodeReplay(task, self.config.replay_capacity, torch.device(device))
         self.capacity = self.replay.capacity * task.spec.horizon
-        with torch.random.fork_rng(devices=[]):  # what others draw from torch stays as it is
+        with torch.random.fork_rng(devices=[]):  # leaves torch's global generator unchanged
             torch.default_generator.manual_seed(seed)
             self.actor = agent.policy(self.size, self.actions)
             learned: dict[str, nn.Module] = {"actor": self.actor, **self.modules()}
         for name, module in learned.items():
             if next(module.buffers(), None) is not None:
                 raise ConfigError(
-                    f"the network {name} has buffers, which no checkpoint would keep: use "
-                    "LayerNorm in the place of BatchNorm"
+                    f"the network {name} has buffers, which checkpoints do not keep: use "
+                    "LayerNorm instead of BatchNorm"
                 )
         super().__init__(learned, self.target_names(), device, compiled=compiled)
         self._settle()
 
     @abstractmethod
     def modules(self) -> dict[str, nn.Module]:
-        """New networks besides the actor, by name; torch's generator stands at the seed."""
+        """New networks besides the actor, by name; torch's generator is seeded before the call."""
 
     @abstractmethod
     def losses(self, batch: Batch) -> Iterator[Loss]:
-        """Yield a network's loss; it makes its step before the next one is asked for."""
+        """Yield each network's loss; the network makes its step before the next is computed."""
 
     def target_names(self) -> tuple[str, ...]:
         """Names of the networks that have a target network."""
         return ("actor", "critic")
 
     def bounded(self, values: Tensor) -> Tensor:
-        """Values (B,) within what the task's rewards can add up to: r / (1 - gamma)."""
+        """Values (B,), clamped to the possible discounted sums of rewards: r / (1 - gamma)."""
         least, most = self._task.spec.rewards
         whole = 1.0 - self.config.gamma
         return values.clamp(min(least, 0.0) / whole, max(most, 0.0) / whole)
 
     @property
     def kept(self) -> int:
-        """Transitions in the replay."""
+        """Number of transitions in the replay buffer."""
         return len(self.replay) * self._task.spec.horizon
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
-        """Keep whole episodes: goals are relabelled when a batch is drawn."""
+        """Add whole episodes; their goals are relabelled when a batch is drawn."""
         self._normaliser.add(self._inputs.of_episodes(episodes))
         self._settle()
         self.replay.add(episodes)
         return episodes.transitions
 
     def rates(self, share: float) -> Rates:  # noqa: ARG002
-        """The same for all networks, and to the end."""
+        """The same constant learning rate for all networks."""
         return Rates(self.config.learning_rate, self.config.learning_rate, 0.0)
 
     def learn(self, seen: Any, share: float = 0.0) -> dict[str, float]:
@@ -145,10 +145,10 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         return numbers
 
     def drawn(self, rng: Streams) -> Batch:
-        """What the next update learns from: all that is random in it is drawn here.
+        """Draw the batch of an update, with all its random numbers.
 
-        Which transitions, with which goals, is drawn on the processor; what was seen lies on the
-        device already.
+        Transitions and goals are drawn on the CPU; the observations of episodes are already on the
+        device.
         """
         found = self.replay.sample(self.config, rng)
         rows, steps = self.tensor(found.rows, np.int64), self.tensor(found.steps, np.int64)
@@ -165,7 +165,7 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         return batch
 
     def blanks(self) -> Iterator[Batch]:
-        """Where the actor moves, and where it does not."""
+        """Example batches to compile for: with an update of the actor, and without."""
         count, size, actions = self.config.batch_size, self.size, self.actions
         shapes = (count, size), (count, actions), (count,), (count,), (count, size)
         normals = (self.draws, count, actions)
@@ -177,29 +177,29 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         return Batch(*parts, acts=self.updates % self.delay == 0)
 
     def _rows(self, seen: Mapping[str, Tensor]) -> Tensor:
-        """(B, F) as networks see them."""
+        """Normalised network inputs (B, F) of fields with B rows each."""
         count = self.config.batch_size
         parts = [seen[name].reshape(count, -1) for name in self._inputs.names]
         rows: Tensor = normalised(torch.cat(parts, dim=1), self._mean, self._scale)
         return rows
 
     def _settle(self) -> None:
-        """Send the statistics to the device."""
+        """Copy the input statistics to the device."""
         self._mean = self.tensor(self._normaliser.mean)
         self._scale = self.tensor(self._normaliser.scale)
 
     def broadcast(self) -> Tensors:
-        """The policy, and the statistics of what it sees."""
+        """The policy and the statistics of its inputs."""
         policy = {POLICY + name: value for name, value in to_arrays(self.actor).items()}
         return {MEAN: self._normaliser.mean, SCALE: self._normaliser.scale, **policy}
 
     def state(self) -> dict[str, Array]:
-        """With the statistics."""
+        """Networks, optimisers and the running statistics of the inputs, for a checkpoint."""
         seen = {f"seen.{name}": value for name, value in self._normaliser.state().items()}
         return super().state() | seen
 
     def load_networks(self, state: Mapping[str, Array]) -> None:
-        """Take over networks and statistics."""
+        """Load the networks and the statistics of the inputs."""
         super().load_networks(state)
         self._normaliser.load_state(under("seen.", state))
         self._settle()

@@ -1,4 +1,4 @@
-"""An agent of an actor and critics, without tensors: settings, and who is made of them."""
+"""Base class of actor-critic agents; does not import torch."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # these load torch
 
 @dataclass(frozen=True)
 class ActorCriticAgent(Agent):
-    """Extend it with settings of your own, and with `learns`.
+    """An actor-critic agent; a subclass adds its own settings and `learns`.
 
     @dataclass(frozen=True)
     class Mine(ActorCriticAgent):
@@ -32,29 +32,29 @@ class ActorCriticAgent(Agent):
 
     @abstractmethod
     def learns(self) -> "type[ActorCritic[Any]]":
-        """The class of its learner."""
+        """The learner's class."""
 
     def policy(self, inputs: int, actions: int) -> "Policy":
-        """A policy of rows of so many entries, the same for actor and learner."""
+        """A policy from rows of `inputs` entries to `actions`, the same for actor and learner."""
         from tangram_agent.flat.networks import Policy  # noqa: PLC0415
 
         return Policy(inputs, actions, self.config)
 
     @property
     def pace(self) -> Pace:
-        """As the settings say."""
+        """The pace in the settings."""
         return Pace(self.config.updates_per_transition, self.config.learning_starts)
 
     def facts(self) -> Json:
-        """Its name."""
+        """The agent's name, for reports."""
         return {"agent": type(self).__name__.lower()}
 
     def check(self, task: Task) -> None:
-        """Refuse a task whose fields are no numbers."""
+        """Refuse a task with fields that are not float numbers."""
         Inputs.check(task.spec)
 
     def actor(self, task: Task) -> Actor:
-        """The policy, to be loaded."""
+        """An actor whose weights are to be loaded."""
         from tangram_agent.flat.playing import PolicyActor  # noqa: PLC0415
 
         inputs = Inputs(task.spec)
@@ -62,5 +62,5 @@ class ActorCriticAgent(Agent):
         return PolicyActor(policy, inputs, self.config.uniform_share)
 
     def learner(self, task: Task, seed: int, device: str, *, compiled: bool = False) -> Learner:
-        """With the weights of a seed."""
+        """A learner with the weights of a seed."""
         return self.learns()(self, task, seed, device, compiled)

@@ -1,4 +1,4 @@
-"""A task's fields as normalised rows of numbers, which networks see.
+"""Network inputs: a task's fields as normalised rows of numbers.
 
 Legend: B rows, E episodes, T steps of an episode, F entries of a row.
 """
@@ -12,20 +12,20 @@ from tangram_core.arrays import Floats, Singles
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
 
-FURTHEST = 5.0  # of a normalised entry, in deviations
-LEAST = 1e-2  # of a deviation: below it an entry counts as constant
+FURTHEST = 5.0  # bound of a normalised entry, in standard deviations
+LEAST = 1e-2  # least standard deviation: below it an entry counts as constant
 
 
 class Inputs:
-    """Which fields make up a row: those of each moment, then those of the episode.
+    """The fields that make up a row: those of each moment, then those of the episode.
 
     Attributes:
-        size: F.
-        names: of these fields, in order.
+        size: F, entries of a row.
+        names: names of these fields, in order.
     """
 
     def __init__(self, spec: EpisodeSpec) -> None:
-        """Take all fields that are observed; `check` those of a task first."""
+        """Take all observed fields of a spec, which must pass `check`."""
         fields = sorted(spec.fields, key=lambda field: field.per == "episode")
         self._spec, self._fields = spec, [field for field in fields if field.per != "step"]
         self.names = tuple(field.name for field in self._fields)
@@ -33,24 +33,24 @@ class Inputs:
 
     @staticmethod
     def check(spec: EpisodeSpec) -> None:
-        """Raise ConfigError for a field that is no row of numbers."""
+        """Raise ConfigError for a field that is not of float numbers."""
         for field in spec.fields:
             if field.dtype != "f4":
                 raise ConfigError(
-                    f"this agent sees numbers, and the field {field.name} of this task is "
-                    f"{field.dtype}: name a task of numbers (task=...), or an agent for such fields"
+                    f"this agent needs fields of float numbers (f4), but {field.name} of this task "
+                    f"is {field.dtype}: set another task, or an agent for such fields"
                 )
 
     def rows(self, seen: Arrays) -> Singles:
-        """(B, F) of fields with B rows each."""
+        """Rows (B, F) of fields with B rows each."""
         count = len(seen[self._spec.achieved])
         parts = [seen[name].reshape(count, -1) for name in self.names]
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
     def of_episodes(self, episodes: Episodes) -> Singles:
-        """(2 * E * (T + 1), F) of all moments: with the goal that was played for, and their own.
+        """Rows (2 * E * (T + 1), F) of all moments, with the desired and with the achieved goal.
 
-        Hindsight takes one for the other, so statistics count both alike.
+        Hindsight replaces the former by the latter, so the statistics count both alike.
         """
         moments, spec = episodes.steps + 1, self._spec
         seen = {
@@ -64,11 +64,11 @@ class Inputs:
 
 
 class Normaliser:
-    """Running mean and deviation of each entry (Chan et al. 1979), in double precision.
+    """Running mean and standard deviation of each entry (Chan et al. 1979), in double precision.
 
     Attributes:
-        size: F.
-        mean, scale: (F,) float32, by which `normalised` goes, in workers as in the master.
+        size: F, entries of a row.
+        mean, scale: (F,) float32 arguments of `normalised`, in workers and in the master.
     """
 
     def __init__(self, size: int) -> None:
@@ -77,7 +77,7 @@ class Normaliser:
         self._settle()
 
     def add(self, rows: Array) -> None:
-        """Take rows (B, F) into account."""
+        """Update the statistics by rows (B, F)."""
         count, mean = len(rows), rows.mean(axis=0, dtype=np.float64)
         squares = np.square(rows - mean).sum(axis=0)
         whole, apart = self._count + count, mean - self._mean
@@ -87,7 +87,7 @@ class Normaliser:
         self._settle()
 
     def state(self) -> dict[str, Array]:
-        """All of it, for a checkpoint."""
+        """The statistics, for a checkpoint."""
         return {
             "count": np.array([self._count]),
             "mean": self._mean.copy(),
@@ -95,10 +95,10 @@ class Normaliser:
         }
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state.
+        """Load statistics from a checkpoint.
 
         Raises:
-            RunError: it is of another task, or no numbers.
+            RunError: they belong to another task, or are not finite.
         """
         wanted = {"count": (1,), "mean": (self.size,), "squares": (self.size,)}
         for name, shape in wanted.items():
@@ -108,8 +108,8 @@ class Normaliser:
                 or not np.isfinite(state[name]).all()
             ):
                 raise RunError(
-                    f"normaliser state: '{name}' must be {shape} finite numbers: it is of another "
-                    "task, or damaged: take another checkpoint"
+                    f"normaliser state: '{name}' must be {shape} finite numbers: it belongs to "
+                    "another task, or is damaged: take another checkpoint"
                 )
         self._count = float(state["count"][0])
         self._mean = np.array(state["mean"], np.float64)
@@ -125,5 +125,5 @@ class Normaliser:
 
 
 def normalised(rows: Any, mean: Any, scale: Any) -> Any:
-    """Rows (B, F), arrays or tensors, as networks see them: of mean 0, deviation 1, within +-5."""
+    """Rows (B, F), arrays or tensors, scaled to mean 0 and deviation 1, and clipped to +-5."""
     return ((rows - mean) / scale).clip(-FURTHEST, FURTHEST)

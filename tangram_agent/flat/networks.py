@@ -11,10 +11,10 @@ from tangram_agent.nets.networks import perceptron, untraced
 
 
 class Policy(nn.Module):
-    """Actions of rows, bounded by tanh; Gaussian noise explores.
+    """Deterministic policy of rows, bounded by tanh, with Gaussian exploration noise.
 
     Attributes:
-        actions: A.
+        actions: A, entries of an action.
     """
 
     def __init__(self, inputs: int, actions: int, config: BaseConfig) -> None:
@@ -23,18 +23,18 @@ class Policy(nn.Module):
         self.actions, self._noise = actions, config.noise
 
     def forward(self, rows: Tensor) -> Tensor:
-        """(B, A) in [-1, 1] of rows (B, F)."""
+        """Actions (B, A) in [-1, 1] for rows (B, F)."""
         untraced()
         return torch.tanh(self.layers(rows))
 
     def explore(self, rows: Tensor, normals: Tensor) -> Tensor:
-        """(B, A) in [-1, 1], with what was drawn from a standard normal (B, A)."""
+        """Actions (B, A) in [-1, 1] with noise, from standard normals (B, A)."""
         actions: Tensor = self(rows) + self._noise * normals
         return actions.clamp(-1.0, 1.0)
 
 
 class Critics(nn.Module):
-    """Values of rows and actions, by several networks that differ in their first weights."""
+    """Several critics of rows and actions, which differ in their first weights."""
 
     def __init__(self, inputs: int, actions: int, config: BaseConfig, count: int = 2) -> None:
         super().__init__()
@@ -43,10 +43,10 @@ class Critics(nn.Module):
         )
 
     def forward(self, rows: Tensor, actions: Tensor) -> Tensor:
-        """(C, B)."""
+        """Values (C, B) by all critics."""
         return torch.stack([self.one(i, rows, actions) for i in range(len(self.each))])
 
     def one(self, index: int, rows: Tensor, actions: Tensor) -> Tensor:
-        """(B,) what one of them says."""
+        """Values (B,) by one critic."""
         value: Tensor = self.each[index](torch.cat([rows, actions], dim=-1))
         return value.squeeze(-1)

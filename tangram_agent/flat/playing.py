@@ -1,4 +1,4 @@
-"""Who acts in a worker by a policy.
+"""The actor of actor-critic agents, which plays a policy in workers.
 
 Legend: B environments, F entries of a row, A entries of an action.
 """
@@ -22,7 +22,7 @@ MEAN, SCALE, POLICY = "mean", "scale", "policy."
 
 
 class Decision(nn.Module):
-    """Actions (B, A) of the task's fields, by name, exploration off."""
+    """Network from the task's fields, by name, to actions (B, A) without exploration."""
 
     mean: Tensor
     scale: Tensor
@@ -34,14 +34,14 @@ class Decision(nn.Module):
         self.register_buffer("scale", torch.from_numpy(scale), persistent=False)
 
     def forward(self, seen: Mapping[str, Tensor]) -> Tensor:
-        """Of fields (B, ...)."""
+        """Actions (B, A) for fields (B, ...)."""
         rows = torch.cat([seen[name].flatten(1) for name in self._names], dim=1)
         actions: Tensor = self.policy(normalised(rows, self.mean, self.scale))
         return actions
 
 
 class PolicyActor(Actor):
-    """A policy, and the statistics that what it sees is normalised with."""
+    """Plays a policy whose inputs are normalised by running statistics."""
 
     def __init__(self, policy: Policy, inputs: Inputs, uniform_share: float) -> None:
         self._policy, self._inputs = policy.requires_grad_(False), inputs
@@ -51,13 +51,13 @@ class PolicyActor(Actor):
 
     @property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Of the statistics and of the policy's parameters."""
+        """Shapes of the statistics and of the policy's parameters, by name."""
         size = (self._inputs.size,)
         own = self._policy.named_parameters()
         return {MEAN: size, SCALE: size} | {POLICY + name: tuple(p.shape) for name, p in own}
 
     def load(self, weights: Mapping[str, Singles]) -> None:
-        """Take over what `ActorCritic.broadcast` gives."""
+        """Load the weights of `ActorCritic.broadcast`."""
         for name in (MEAN, SCALE):
             if name not in weights or weights[name].shape != self.shapes[name]:
                 raise RunError(
@@ -70,17 +70,17 @@ class PolicyActor(Actor):
         self._mean, self._scale = np.array(weights[MEAN]), np.array(weights[SCALE])
 
     def graph(self) -> "Decision":
-        """The policy behind its normaliser."""
+        """The normalisation and the policy, as one network."""
         return Decision(self._policy, self._inputs.names, self._mean, self._scale)
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
-        """What the policy does; where it explores, with noise, or now and then something else."""
+        """Actions (B, A); while exploring, with noise and a share of them uniform."""
         rows = torch.from_numpy(normalised(self._inputs.rows(seen), self._mean, self._scale))
         with torch.no_grad():
             if explore is None:
                 return np.asarray(self._policy(rows).numpy(), np.float32)
             size = self._policy.actions
-            # Always the same draws, so that an episode's later ones hang on nothing else.
+            # All numbers are always drawn, so that later ones do not depend on the choice below.
             drawn = [
                 (one.random(), one.uniform(-1, 1, size), one.standard_normal(size))
                 for one in explore

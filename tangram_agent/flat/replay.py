@@ -1,4 +1,4 @@
-"""Whole episodes, and transitions of them whose goal may be another: hindsight.
+"""The replay buffer of whole episodes, whose transitions are drawn with hindsight goals.
 
 Legend: B transitions, E episodes, T steps of an episode, A entries of an action.
 """
@@ -18,18 +18,18 @@ from tangram_core.spec import ACTIONS, Array, Episodes
 from tangram_core.task import Task
 
 CPU = torch.device("cpu")
-MOVED_SHARE = 0.5  # of a batch, from episodes whose goal was not achieved at their start already
+MOVED_SHARE = 0.5  # share of a batch from episodes in which something moved
 
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """What a batch is made of.
+    """A batch of drawn transitions.
 
     Attributes:
-        rows, steps: (B,) of which episode, by its slot, and which step of it.
-        desired: (B, ...) the goals.
-        rewards: (B,) for these.
-        terminated: (B,) for these.
+        rows, steps: (B,) slot of the episode, and step in the episode.
+        desired: (B, ...) the desired goals.
+        rewards: (B,) rewards for these goals.
+        terminated: (B,) whether the step terminated the episode for these goals.
     """
 
     rows: Ints
@@ -40,10 +40,10 @@ class Transitions:
 
 
 class EpisodeReplay(Ring):
-    """The newest episodes, on the processor and where it is learned from them."""
+    """Replay buffer of the newest episodes, on the CPU and on the learner's device."""
 
     def __init__(self, task: Task, transitions: int, place: torch.device = CPU) -> None:
-        """Room for as many whole episodes as so many transitions make, and for one at least."""
+        """Make room for so many transitions in whole episodes, at least for one episode."""
         self._task, self._spec, self._place = task, task.spec, place
         room = self._spec.empty(max(1, transitions // self._spec.horizon))
         every = self._spec.every
@@ -52,15 +52,15 @@ class EpisodeReplay(Ring):
         goal = self._spec.desired  # comes with each batch
         self._seen = [f for f in self._spec.fields if f.per != "step" and f.name != goal]
         names = [*(field.name for field in self._seen), ACTIONS]
-        # On the processor these are the arrays themselves.
+        # On a CPU these tensors share memory with the arrays.
         self._held = {name: torch.from_numpy(self.arrays[name]).to(place) for name in names}
 
     def add(self, episodes: Episodes) -> None:
-        """Append episodes; the oldest make room."""
+        """Append episodes and drop the oldest beyond the capacity."""
         self._took(self.append(episodes.arrays))
 
     def _took(self, slots: Ints) -> None:
-        """Send what is new to where it is learned from, and note which episodes moved."""
+        """Copy new episodes to the learner's device, and note in which of them something moved."""
         if self._place.type != "cpu":
             where = torch.from_numpy(slots).to(self._place)
             for name, held in self._held.items():
@@ -68,13 +68,13 @@ class EpisodeReplay(Ring):
         self._look(slots)
 
     def _look(self, slots: Ints) -> None:
-        """Note which episodes came to what would not have been reached at their start."""
+        """Note in which episodes the goal achieved at the end was not yet achieved at the start."""
         achieved = self.arrays[self._spec.achieved][slots]
         first, last = achieved[:, 0], achieved[:, -1]
         self._moved[slots] = self._task.rewards(first, last) < self._task.rewards(last, last)
 
     def sample(self, config: BaseConfig, rng: Streams) -> Transitions:
-        """A batch, drawn with replacement; a share of it has another goal.
+        """A batch, drawn with replacement; a share of it has hindsight goals.
 
         Raises:
             ValueError: the replay is empty.
@@ -98,10 +98,10 @@ class EpisodeReplay(Ring):
     def goals(
         self, config: EpisodeConfig, rows: Ints, steps: Ints, ends: Ints, rng: np.random.Generator
     ) -> tuple[Array, Bools]:
-        """Goals (B, ...) of steps (B,) of episodes that end at moments (B,), and which are others.
+        """Goals (B, ...) of steps (B,) in episodes with ends (B,), and whether each is relabelled.
 
-        A goal that another moment achieved is one that the step might have been made for, and the
-        task says what it would have been worth (Andrychowicz et al. 2017).
+        A step might have been made for a goal that was achieved later, and the task gives its
+        reward for that goal (Andrychowicz et al. 2017).
         """
         other = rng.random(len(rows)) < config.relabel_share
         moments = later(steps, ends, rng)
@@ -111,11 +111,11 @@ class EpisodeReplay(Ring):
         return desired, other
 
     def relabelled(self, desired: Array, reached: Array, rng: np.random.Generator) -> Array:  # noqa: ARG002
-        """(n, ...) goals that take the place of the desired ones, of those that were reached."""
+        """Goals (n, ...) that replace the desired ones, made of the reached ones."""
         return reached
 
     def seen(self, rows: Tensor, moments: Tensor, desired: Tensor) -> dict[str, Tensor]:
-        """What was seen in episodes (B,) at moments (B,), with goals (B, ...); B rows each."""
+        """Fields of episodes (B,) at moments (B,) with goals (B, ...), by name; B rows each."""
         where = rows * (self._spec.horizon + 1) + moments
         seen = {self._spec.desired: desired}
         for field in self._seen:
@@ -125,14 +125,14 @@ class EpisodeReplay(Ring):
         return seen
 
     def actions(self, rows: Tensor, steps: Tensor) -> Tensor:
-        """(B, A) what was done in episodes (B,) at steps (B,)."""
+        """Actions (B, A) in episodes (B,) at steps (B,)."""
         where = rows * self._spec.horizon + steps
         return self._held[ACTIONS].flatten(0, 1).index_select(0, where)
 
     def _chosen(self, config: BaseConfig, rng: np.random.Generator) -> Ints:
-        """(B,) episodes, by their slots; some of those that moved, where there are such.
+        """Slots (B,) of drawn episodes; a share from those in which something moved.
 
-        Where little moves at first, most achieved goals are reached whatever is done, and teach
+        At first little may move. Then most achieved goals are reached by any action, and teach
         nothing (after Zhao and Tresp 2018, who weigh episodes by energy).
         """
         rows, moved = self.drawn(config.batch_size, rng), np.flatnonzero(self._moved)
@@ -142,13 +142,13 @@ class EpisodeReplay(Ring):
         return rows
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state, see `Ring`."""
+        """Load a state, see `Ring.load_state`."""
         super().load_state(state)
         self._moved[:] = False
         self._took(self._slots())
 
 
 def later(steps: Ints, ends: Ints, rng: np.random.Generator) -> Ints:
-    """(B,) a moment after each of these steps, any up to the end."""
+    """Random moments (B,) after each of these steps, up to the ends of their episodes."""
     ahead: Ints = np.floor(rng.random(len(steps)) * (ends - steps)).astype(np.int64)
     return steps + 1 + ahead

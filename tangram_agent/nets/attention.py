@@ -10,14 +10,14 @@ from torch import Tensor, nn
 
 from tangram_agent.base.config import HEADS, NetConfig
 
-# Added to the score of two nodes without an edge: its exponential is exactly zero, and finite.
+# Added to the scores of nodes without an edge: finite, but the exponential is exactly zero.
 NO_EDGE = -1e30
-# Up to so many nodes torch's own softmax is slower than its definition.
+# Up to so many nodes torch's own softmax is slower than the plain formula.
 SHORT_ROW = 16
 
 
 class Drawn(nn.Linear):
-    """A layer without bias whose weights are drawn within a bound of its own, if any."""
+    """A linear layer without bias; `initialise` draws its weights within `bound`, if given."""
 
     def __init__(self, inputs: int, outputs: int, bound: float | None) -> None:
         super().__init__(inputs, outputs, bias=False)
@@ -27,14 +27,14 @@ class Drawn(nn.Linear):
 class GraphAttention(nn.Module):
     """One MHA layer: Eqs. 9-12.
 
-    Keys, queries and values of all heads are one matrix without bias; W_m of Eq. 12 for all heads
-    side by side is another.
+    One matrix without bias computes the keys, queries and values of all heads. Another one holds
+    W_m of Eq. 12 for all heads side by side.
     """
 
     def __init__(self, width: int, heads: int, init: str) -> None:
         super().__init__()
         self.heads, self.key_width = heads, width // heads
-        # Eq. 10 divides by d, which the authors' code has as the root of the key width.
+        # Eq. 10 divides by d; in the authors' code that is the root of the key width.
         self.scale = 1.0 / math.sqrt(self.key_width)
         self.query_key_value = Drawn(width, 3 * width, self.scale if init == "authors" else None)
         self.combine = nn.Linear(width, width, bias=False)
@@ -70,8 +70,8 @@ def softmax_mean(scores: Tensor, value: Tensor) -> Tensor:
 class EncoderLayer(nn.Module):
     """One round of message passing, Eq. 13: attention and g, each with a skip connection.
 
-    g is width-feed_forward-width with one ReLU between, as in the authors' code: a single layer, as
-    Eq. 8 has it, would not give the paper's 504k.
+    g has two layers, width-feed_forward-width, with a ReLU between, as in the authors' code. A
+    single layer, as in Eq. 8, would not give the paper's 504k parameters.
     """
 
     def __init__(self, config: NetConfig) -> None:
@@ -93,7 +93,7 @@ class EncoderLayer(nn.Module):
 class GraphEncoder(nn.Module):
     """Embedding of the nodes and L rounds of message passing.
 
-    The embedding has no bias, another finding from the parameter count.
+    The embedding has no bias: only so the number of parameters is the paper's.
     """
 
     def __init__(self, features: int, config: NetConfig) -> None:

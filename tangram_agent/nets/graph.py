@@ -1,13 +1,12 @@
-"""What actor and critic ask of a graph (Sec. IV-A), and the turns that its features are made of.
+"""The interface of a graph for actor and critic (Sec. IV-A), and rotations for its features.
 
-`SceneGraph` has all tokens and the whole target, as the paper has it. `PairGraph` has one token and
-one piece of the target: with one token that is the whole scene too. The same
-actor and critic work on both.
+`SceneGraph` has all tokens and the whole target, as in the paper. `PairGraph` has one token and one
+piece of the target: with one token that is the whole scene, too. The same `Head` reads both.
 
 Legend here, in `scenes.py` and in `pairs.py`: M views, K tokens and V corners of a view, C corners
 of the largest token, N nodes, F features. Node order: token corners, bases, target corners. A turn
 is a unit complex number, stored as (cos, sin) in the last dimension. A velocity (M, 3) is
-normalised: x and y times the arena's width, the angle times pi.
+normalised: the unit of x and y is the arena's width, that of the angle is pi.
 """
 
 from typing import Any, Protocol
@@ -17,14 +16,14 @@ from torch import Tensor
 
 
 class Graph(Protocol):
-    """What actor and critic ask of a graph; each graph knows views of its own kind.
+    """The interface of a graph for actor and critic; each graph has its own type of view.
 
     Attributes:
-        tokens: K, in view.
+        tokens: K, tokens of a view.
         corners: V, nodes before the first base.
         adjacency: (N, N) edges.
-        features: F.
-        inputs: numbers that a perceptron sees of a view.
+        features: F, features of a node.
+        inputs: numbers of a view for a perceptron.
     """
 
     tokens: int
@@ -37,7 +36,7 @@ class Graph(Protocol):
         """Features (M, N, F)."""
 
     def vectors(self, view: Any, /) -> Tensor:
-        """(M, inputs): a view in one row."""
+        """Inputs (M, inputs) of a perceptron: each view in one row."""
 
     def base_node(self, view: Any, /) -> Tensor:
         """Node index (M,) of the base of the token that moves."""

@@ -21,9 +21,9 @@ _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 class Head(nn.Module):
     """Outputs (M, outputs) of views, by attention over the graph or by a perceptron.
 
-    Attention reads the mean of all nodes, projected, or (`at_base`) the embedding of the moving
-    token's base joined to it. The paper computes actions for all nodes and extracts the base's: the
-    same numbers. A perceptron has one group of outputs per token in view.
+    Attention reads the projected mean of all nodes, and with `at_base` also the embedding of the
+    moving token's base. The paper computes actions for all nodes and takes that of the base, which
+    gives the same numbers. With `at_base` a perceptron has one group of outputs per token.
     """
 
     def __init__(
@@ -38,10 +38,10 @@ class Head(nn.Module):
         """Make the layers.
 
         Args:
-            graph: what is seen.
-            net: size and kind.
+            graph: the graph of the views.
+            net: settings of size and kind.
             outputs: numbers for each view.
-            at_base: read at the token that moves.
+            at_base: whether to read at the base of the moving token.
             action: numbers that `forward` appends to the moving token's base node.
         """
         super().__init__()
@@ -60,9 +60,9 @@ class Head(nn.Module):
         action: Tensor | None = None,
         features: Tensor | None = None,
     ) -> Tensor:
-        """(M, outputs) of views, with an action (M, action) for a head that takes one.
+        """Outputs (M, outputs) of views, with an action (M, action) for a head that takes one.
 
-        Features, by `see`, may be handed in where they were made before.
+        `features` are the result of `see`, if it was computed before.
 
         Raises:
             ConfigError: see `untraced`.
@@ -79,7 +79,7 @@ class Head(nn.Module):
             groups = outputs.view(seen.shape[0], self.graph.tokens, -1)
             return groups[rows, base - self.graph.corners]
         if action is not None:
-            # Other nodes than the base carry zeros there.
+            # All nodes but the base have zeros there.
             appended = seen.new_zeros(*seen.shape[:2], action.shape[-1])
             appended[rows, base] = action
             seen = torch.cat([seen, appended], dim=-1)
@@ -91,20 +91,20 @@ class Head(nn.Module):
         return outputs
 
     def see(self, view: Any) -> Tensor:
-        """What the layers take of views: features of nodes (M, N, F), or one row for each."""
+        """Inputs of the layers: node features (M, N, F) of views, or one row for each view."""
         seen = self.graph.node_features if self.attends else self.graph.vectors
         return seen(view)
 
 
 def untraced() -> None:
-    """Refuse to be traced: a trace repeats for all scenes what was done for one.
+    """Refuse torch.jit.trace, which would repeat the choices for one scene in all scenes.
 
     Raises:
         ConfigError: torch.jit.trace is at work.
     """
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         raise ConfigError(
-            "torch.jit.trace would do for all scenes what it saw done for one: use tangram-export"
+            "torch.jit.trace would repeat the choices for one scene in all: use tangram-export"
         )
 
 
@@ -115,7 +115,7 @@ def perceptron(
     norm: bool = False,
     kind: type[nn.Module] = nn.ReLU,
 ) -> nn.Sequential:
-    """Linear layers with ReLU or another kind between, normalised before it if `norm` says so."""
+    """Linear layers with activations of a kind between, each after a LayerNorm if `norm`."""
     layers: list[nn.Module] = []
     for size in hidden:
         layers += [nn.Linear(inputs, size), *([nn.LayerNorm(size)] if norm else []), kind()]
@@ -124,7 +124,7 @@ def perceptron(
 
 
 def initialise(module: nn.Module, generator: torch.Generator) -> None:
-    """Uniform weights and biases within 1/sqrt(inputs) or a layer's `bound`, by a generator."""
+    """Draw weights and biases uniformly within 1/sqrt(inputs), or within a layer's `bound`."""
     with torch.no_grad():
         for layer in module.modules():
             if isinstance(layer, nn.Linear):
@@ -136,5 +136,5 @@ def initialise(module: nn.Module, generator: torch.Generator) -> None:
 
 
 def parameter_count(*modules: nn.Module) -> int:
-    """Trainable numbers of all modules together (Table I)."""
+    """Number of trainable parameters of all modules together (Table I)."""
     return sum(p.numel() for module in modules for p in module.parameters() if p.requires_grad)

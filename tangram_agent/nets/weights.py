@@ -9,7 +9,7 @@ from torch import nn
 from tangram_core.errors import RunError
 from tangram_core.spec import Array
 
-MOST = 1e6  # of a parameter's magnitude; what is learned stays far below
+MOST = 1e6  # bound of a parameter's magnitude; learned ones stay far below
 
 
 def load_arrays(
@@ -18,12 +18,12 @@ def load_arrays(
     """Copy named arrays into a module's parameters.
 
     Args:
-        module: takes them.
-        arrays: by the names of parameters.
-        names: of those that there must be; None: all.
+        module: the module to change.
+        arrays: arrays by the names of parameters.
+        names: names of the parameters that must be given; None: all.
 
     Raises:
-        RunError: names or shapes differ, or numbers are none; says which first.
+        RunError: names or shapes differ, or numbers are not finite; names the first one.
     """
     every = module.named_parameters()
     own = {name: p for name, p in every if names is None or name in names}
@@ -41,7 +41,7 @@ def load_arrays(
                     f"this setup needs {tuple(parameter.shape)}: start with the run's own tokens, "
                     "agent and net"
                 )
-            if not np.abs(arrays[name]).max(initial=0.0) <= MOST:  # nor is a NaN
+            if not np.abs(arrays[name]).max(initial=0.0) <= MOST:  # NaN fails, too
                 raise RunError(
                     f"damaged weights: '{name}' must hold finite numbers up to {MOST:g}: take them "
                     "from another checkpoint"

@@ -1,4 +1,4 @@
-"""What the processes of a run share: how they work together, end, are watched, and what came of it.
+"""Code that all processes of a run share: settings, ends, watchdog, logs, user code, results.
 
 Start with `service.py`. May import the rest of tangram_core.
 """

@@ -1,7 +1,7 @@
-"""Code of the user's own: which settings name it, and how it is read from a file.
+"""The user's own code: which settings name it, and how it is loaded from a file.
 
-Settings may come from anybody: from a run's folder or a master. So what they name is loaded only
-where a command line, or a program, names it itself.
+Settings may come from a stranger, in a run's folder or from a master. So the code that they name is
+loaded only if the command line, or the calling program, names it, too.
 """
 
 import hashlib
@@ -18,30 +18,30 @@ from typing import Any
 from tangram_core.errors import ConfigError, OwnCodeError
 
 IMPORTS = "imports"  # setting of any section: modules to import
-KIND = "kind"  # setting of a section that names what it is of: task.kind is given as task
+KIND = "kind"  # setting that names the class of a section: task.kind is given as task
 KNOWN = ("gymnasium_robotics", "panda_gym")  # modules of the extra `robotics`
 _ESCAPED = re.compile(r"(\\*)('|\$\{|$)")
 PLAIN = re.compile(r"[\w.]+=[\w./:-]+", re.ASCII)
 
-_named = set[str]()  # modules
-_files = set[Path]()  # that were loaded
+_named = set[str]()  # modules that may be imported
+_files = set[Path]()  # files that were loaded
 
 
 def own_code(name: str) -> tuple[Path, str] | None:
-    """File and name of what is in it, where a setting is code of the user's own."""
+    """File and class of a value path/to/file.py:Name; None for any other value."""
     path, _, what = name.rpartition(":")
     if not (path.endswith(".py") and what.isidentifier()):
         return None
-    with suppress(RuntimeError):  # there is no such user
+    with suppress(RuntimeError):  # ~name of an unknown user
         return Path(path).expanduser(), what
     return Path(path), what
 
 
 def override(name: str, value: str) -> str:
-    """A setting whose value may hold anything, such as a path with blanks or `=`, for hydra."""
-    if names_modules(name):  # a list, and it stays one
+    """A setting as name='value' for hydra; the value may hold blanks, `=` and quotes."""
+    if names_modules(name):  # a list stays a list
         return f"{name}={value}"
-    # Backslashes escape only a quote and ${, which would be looked up.
+    # Hydra takes backslashes as escapes only before a quote and ${.
     return f"{name}='{re.sub(_ESCAPED, _escaped, value)}'"
 
 
@@ -50,21 +50,21 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 def argument(name: str, value: object) -> str:
-    """A setting to be pasted into a shell; quoted for it and for hydra where it must be."""
+    """A setting as name=value for a shell, quoted for the shell and for hydra if needed."""
     plain = f"{name}={value}"
     return plain if PLAIN.fullmatch(plain) else shlex.quote(override(name, str(value)))
 
 
 def unquoted(value: str) -> str:
-    """A value as it was before it was quoted, or its signs escaped, for a command line."""
+    """The value without the quotes and escapes that `override` adds."""
     quoted = len(value) > 1 and value[0] == value[-1] == "'"
     return re.sub(r"\\(.)", r"\1", value[1:-1] if quoted else value)
 
 
 def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:
-    """The settings of a run that are code, which each of its commands must name itself.
+    """The settings of a run that name code, as setting -> value for a command line.
 
-    These are the values path/to/file.py:Name, and lists of modules.
+    These are values path/to/file.py:Name and lists of modules. Each command must name them again.
     """
     found = dict[str, str]()
     for section, content in resolved.items():
@@ -83,15 +83,15 @@ def names_modules(name: str) -> bool:
 
 
 def name_modules(modules: str) -> None:
-    """Let modules be imported that a command line names, as [one,other]."""
+    """Allow the import of modules from a command line, given as [one,other]."""
     _named.update(one.strip() for one in modules.strip("[]").split(","))
 
 
 def check_module(setting: str, module: str) -> None:
-    """Refuse a module that a setting names, and nobody named here or has imported.
+    """Refuse a module in the settings that was neither named on the command line nor imported.
 
     Raises:
-        ConfigError: says what to add.
+        ConfigError: names the argument to add.
     """
     if module not in {*KNOWN, *_named, *sys.modules}:
         raise ConfigError(
@@ -101,20 +101,23 @@ def check_module(setting: str, module: str) -> None:
 
 
 def read_code(setting: str, given: str, path: Path, sha256: str | None = None) -> tuple[bytes, str]:
-    """Content of a user's file, and its digest.
+    """Read a user's file.
 
     Args:
-        setting: that names it, for errors.
-        given: its value.
-        path: of the file.
-        sha256: that it must have; None: any.
+        setting: name of the setting that names the file, for errors.
+        given: value of the setting.
+        path: path of the file.
+        sha256: digest that the file must have; None: any.
+
+    Returns:
+        Content and sha256 digest.
 
     Raises:
-        ConfigError: it cannot be read, or has another content.
+        ConfigError: the file cannot be read, or has another digest.
     """
     try:
         if path.exists() and not path.is_file():
-            raise OSError(0, "it is no file")  # a pipe would be waited for
+            raise OSError(0, "it is no file")  # reading a pipe would block
         source = path.read_bytes()
     except OSError as error:
         raise ConfigError(
@@ -126,19 +129,19 @@ def read_code(setting: str, given: str, path: Path, sha256: str | None = None) -
     if sha256 not in (None, found):
         raise ConfigError(
             f"{setting}={given}: '{path}' has sha256 {found}, and the settings of the run want "
-            f"{sha256}: name the file that it began with, or begin a new run"
+            f"{sha256}: name the file that the run began with, or begin a new run"
         )
     return source, found
 
 
 def load_code(setting: str, given: str, path: Path, name: str, source: bytes) -> Any:
-    """What a user's file has under a name.
+    """The object with a name in a user's file, which is executed at the first call.
 
     Raises:
-        ConfigError: it cannot be loaded, or has none.
+        ConfigError: the file cannot be loaded, or has no such name.
     """
-    # Registered as an import would, since dataclasses look their module up. A user's file is not
-    # found by this name; two files with one name do not meet, and a task knows its own agent.
+    # Registered like an import, since dataclasses look up their module. The name comes from the
+    # content, so two files of one name do not collide, and a file is executed once.
     full = f"_tangram_own_{hashlib.sha256(source).hexdigest()[:16]}"
     module = sys.modules.get(full)
     _files.add(path)
@@ -156,7 +159,7 @@ def load_code(setting: str, given: str, path: Path, name: str, source: bytes) ->
             f"{setting}={given}: cannot load '{path}' ({type(error).__name__}: {error}): it must "
             "be one file that needs nothing but installed packages"
         ) from error
-    except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
+    except (Exception, SystemExit) as error:  # the user's code may raise anything
         raise OwnCodeError(f"{setting}={given}: cannot load '{path}': {where(error)}") from error
     if not hasattr(module, name):
         raise ConfigError(f"{setting}={given}: '{path}' has no '{name}'")
@@ -164,11 +167,11 @@ def load_code(setting: str, given: str, path: Path, name: str, source: bytes) ->
 
 
 def where(error: BaseException) -> str:
-    """An exception of a user's code in one line, with the place in it, where it passed there."""
+    """An exception in one line, with the last place in the user's code, if it passed there."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if Path(one.filename) in _files] or frames
     line = " ".join(f"{type(error).__name__}: {error}".split())
-    if isinstance(error, SyntaxError):  # it names the place itself
+    if isinstance(error, SyntaxError):  # its text names the place
         return line
     place = f"{own[-1].filename}, line {own[-1].lineno}, in {own[-1].name}"
     return f"{line} ({place})"

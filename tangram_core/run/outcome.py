@@ -1,4 +1,4 @@
-"""What a run has come to, in words: the rows that follow from its result.json."""
+"""The result of a run in words, from its result.json."""
 
 import json
 from collections.abc import Mapping
@@ -10,12 +10,12 @@ from tangram_core.scores import read
 
 FILE_NAME = "result.json"
 BOUNDS = ("max_hours", "max_episodes", "max_updates")
-ROWS = 6  # of scores
+ROWS = 6  # scores that are shown
 CTRL_C = {"SIGINT": "Ctrl-C (SIGINT)"}
 
 
 def read_outcome(path: Path) -> dict[str, Any]:
-    """A result.json that has all that `outcome_rows` and `bound_of` need; else RunError."""
+    """Read a result.json; RunError if `outcome_rows` or `bound_of` cannot use it."""
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
         outcome_rows(result)
@@ -23,13 +23,13 @@ def read_outcome(path: Path) -> dict[str, Any]:
     except UNREADABLE as error:
         raise RunError(
             f"{path} is no result of a run ({error!r}): name another folder, or "
-            "delete the file, without which resume=auto goes on from the last checkpoint"
+            "delete the file: then resume=auto goes on from the last checkpoint"
         ) from None
     return dict(result)
 
 
 def outcome_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What people want to know of a result, as names and texts."""
+    """Rows (name, text) that show a result to people."""
     scores = read(result["scores"])
     shown = [score for score in scores[:ROWS] if result[score.name] is not None] or scores[:1]
     rows = [(score.label, score.shown(result[score.name])) for score in shown]
@@ -47,7 +47,7 @@ def outcome_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def bound_of(result: Mapping[str, Any]) -> tuple[str, float]:
-    """The setting that ended a run and what was reached; none where a signal did."""
+    """The setting that ended a run and the value reached; ("", 0.0) if a signal ended the run."""
     if not result["ended_by"].isprintable():
         raise ValueError("ended_by is no plain text")
     name, _, reached = result["ended_by"].partition("=")
@@ -55,12 +55,12 @@ def bound_of(result: Mapping[str, Any]) -> tuple[str, float]:
 
 
 def plural(count: float, noun: str) -> str:
-    """1 worker, 2 workers."""
+    """A count with its noun, as in 1 worker, 2 workers."""
     return f"{count:,.0f} {noun}" if count == 1 else f"{count:,.0f} {noun}s"
 
 
 def duration(seconds: float) -> str:
-    """0:07, 12:34 or 1:02:03."""
+    """A duration as 0:07, 12:34 or 1:02:03."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

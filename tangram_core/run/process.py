@@ -1,10 +1,10 @@
-"""What every process of the service needs: its parent's end, a watchdog, logs, memory.
+"""Tools of every process of the service: lifeline to the parent, watchdog, logs, memory.
 
-No orphans: a child process ends when the process that started it is gone, however it went. The
-parent keeps the write end of a pipe for each child and never hands it on, so the kernel closes
-it even after SIGKILL. The child inherits the read end, whose number stands in an environment
-variable, and a thread waits there for the end of the file. Lines that the parent writes in the
-meantime are news for the child's user, since two processes must not draw on one terminal.
+No orphans: a child process ends when its parent is gone, for whatever reason. The parent keeps the
+write end of a pipe for each child and passes it to no process, so the kernel closes it even after
+SIGKILL. The child inherits the read end, whose number is in an environment variable. A thread of
+the child waits there for the end of the file. Lines that the parent writes before are news for the
+child's user, since two processes must not draw on one terminal.
 """
 
 import ctypes
@@ -22,23 +22,23 @@ from pythonjsonlogger.json import JsonFormatter
 
 from tangram_core.errors import ConfigError
 
-# Names the file number of the lifeline's read end to the child.
+# Environment variable with the file number of the lifeline's read end.
 VARIABLE = "TANGRAM_LIFELINE"
 GRACE_S = 10.0
-# Winding the clock up takes a thread each time.
+# Restarting the clock of faulthandler starts a thread each time.
 WIND_S = 1.0
 STDERR = 2
 FORMATS = ("text", "json")
-# Options of glibc's mallopt and their values in bytes; of the second glibc takes no more.
+# Options of glibc's mallopt and their values in bytes; glibc allows no more for the second.
 TRIM_THRESHOLD, MMAP_THRESHOLD = (-1, 2**28), (-3, 2**25)
 NO_EVENT = "note"
 
 
 class Lifeline:
-    """The parent's side, one for each child.
+    """The parent's end of the pipe to one child.
 
-    Start the child with `pass_fds=(read_end,)` and `environment`, then call `started`, and `cut`
-    when the child has ended or shall end.
+    Start the child with `pass_fds=(read_end,)` and `environment`, then call `started`. Call `cut`
+    when the child has ended, or to end it.
 
     Attributes:
         read_end: file number that the child inherits.
@@ -46,19 +46,19 @@ class Lifeline:
 
     def __init__(self) -> None:
         self.read_end, self._write_end = os.pipe()
-        # A child that does not read must not stop its parent.
+        # A child that does not read must not block its parent.
         os.set_blocking(self._write_end, False)
 
     def environment(self, base: Mapping[str, str]) -> dict[str, str]:
-        """The child's environment."""
+        """The environment variables for the child: `base` and the number of the read end."""
         return {**base, VARIABLE: str(self.read_end)}
 
     def started(self) -> None:
-        """Close the read end here: the child has its own now."""
+        """Close the parent's copy of the read end, after the child has started."""
         os.close(self.read_end)
 
     def tell(self, line: str) -> bool:
-        """Send one line to the child; False when it cannot take it."""
+        """Send one line to the child; False if the pipe is full or closed."""
         try:
             os.write(self._write_end, f"{line}\n".encode())
         except OSError:
@@ -66,22 +66,24 @@ class Lifeline:
         return True
 
     def cut(self) -> None:
-        """Close the write end: a child that still lives ends now."""
+        """Close the write end, which ends a child that still lives."""
         os.close(self._write_end)
 
 
 def watch_parent(on_line: Callable[[str], None] | None = None, grace_s: float = GRACE_S) -> bool:
-    """Start the child's side: SIGTERM to itself at the parent's end, and after grace_s the end.
+    """Watch the parent in a thread: when it is gone, send SIGTERM to this process, then exit.
 
-    `on_line` takes each line that the parent sends, in the watching thread.
+    Args:
+        on_line: called in the watching thread with each line that the parent sends.
+        grace_s: seconds between SIGTERM and the exit.
 
     Returns:
         Whether there is a parent to watch.
 
     Raises:
-        ConfigError: the variable names no open file.
+        ConfigError: the environment variable names no open file.
     """
-    # Taken out, so that processes started from here do not watch a parent that is not theirs.
+    # Removed, so that children of this process do not watch its parent.
     value = os.environ.pop(VARIABLE, None)
     if value is None:
         return False
@@ -109,25 +111,25 @@ def _wait(handle: int, on_line: Callable[[str], None] | None, grace_s: float) ->
     os._exit(1)
 
 
-WATCHDOG_S = 300.0  # without progress: longer than a large checkpoint on a slow disk
-PATIENT_S = 3600.0  # where a compiler runs: minutes for a large update on a busy machine
+WATCHDOG_S = 300.0  # without progress; writing a large checkpoint to a slow disk takes less
+PATIENT_S = 3600.0  # while compiling, which takes minutes for a large update on a busy machine
 
 
-watching = list[Callable[[], object]]()  # called while something long makes progress
+watching = list[Callable[[], object]]()  # functions that `still_alive` calls
 
 
 def still_alive() -> None:
-    """Tell the process's watchdog, and others who ask, of progress: a disk may be slow for long."""
+    """Tell the functions in `watching` that a long task, as writing to a slow disk, goes on."""
     for progressed in watching:
         progressed()
 
 
 class Watchdog:
-    """Ends a process that lives but makes no progress, with the stacks of all threads on stderr.
+    """Ends this process if it makes no progress, and prints the stacks of all threads to stderr.
 
-    The clock runs in a thread of C that needs no interpreter, so it also sees a process that hangs
-    in an extension. Whoever started the process sees it end, and starts it again. It begins to
-    watch when it is entered; 0 seconds is never.
+    The clock runs in a C thread without the interpreter, so it also ends a process that hangs in an
+    extension. The parent sees the end and starts the process again. The watchdog is a context
+    manager and watches inside the `with`; with 0 seconds it does nothing.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -144,13 +146,13 @@ class Watchdog:
             faulthandler.cancel_dump_traceback_later()
 
     def progress(self) -> None:
-        """The process is alive: count the seconds anew; cheap enough for every turn of a loop."""
+        """Restart the clock; cheap enough to be called in every turn of a loop."""
         if self._seconds and time.monotonic() - self._wound_s >= WIND_S:
             self._wind()
 
     @contextmanager
     def patient(self, seconds: float = PATIENT_S) -> Iterator[None]:
-        """What is done within may take so long without progress."""
+        """Allow `seconds` without progress inside the `with`."""
         self._wind(seconds)
         try:
             yield
@@ -167,9 +169,9 @@ class Watchdog:
 def handling(
     handle: Callable[[signal.Signals], None], numbers: Iterable[signal.Signals]
 ) -> Iterator[None]:
-    """These signals call a function, until what was there before is put back.
+    """Handle signals with a function inside the `with`; then restore the earlier handlers.
 
-    Not those that are ignored: nohup and scripts let children ignore some.
+    Signals that are ignored stay ignored: nohup and scripts make children ignore some.
     """
     before = {
         number: signal.signal(number, lambda n, _frame: handle(signal.Signals(n)))
@@ -184,11 +186,11 @@ def handling(
 
 
 def keep_memory() -> None:
-    """Keep memory that was freed for what comes next; other C libraries than glibc do as they do.
+    """Make glibc keep freed memory for later use; other C libraries are not changed.
 
-    An update frees tens of megabytes at its end, and so does a picture that was looked at. glibc
-    hands them back to the system. To get them again, page by page, takes a sixth of an update of
-    attention, and a tenth of an episode in which tokens are seen.
+    An update frees tens of megabytes at its end, and so does the reading of a picture. By default
+    glibc returns them to the system. Getting them back page by page takes a sixth of an update of
+    an attention network, and a tenth of an episode with pictures.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -197,10 +199,14 @@ def keep_memory() -> None:
 
 
 def formatter(log_format: str, who: str) -> logging.Formatter:
-    """How a process writes its lines, in one of `FORMATS`.
+    """The formatter of a process's log lines.
 
     JSON lines have `time` (ISO 8601, UTC), `level`, `process`, `event`, `message`, and the fields
     of the event, which callers give to the logger as `extra`.
+
+    Args:
+        log_format: one of `FORMATS`.
+        who: name of the process.
     """
     if log_format == "json":
         return JsonFormatter(
@@ -214,14 +220,14 @@ def formatter(log_format: str, who: str) -> logging.Formatter:
 
 
 class Every:
-    """An interval of a loop: `due` is true at most once in it."""
+    """A timer for loops: `due` is true at most once in each interval."""
 
     def __init__(self, seconds: float, at_once: bool = False) -> None:
         self._seconds = seconds
         self._next_s = 0.0 if at_once else time.monotonic() + seconds
 
     def due(self) -> bool:
-        """Whether the interval has passed; starts the next one if so."""
+        """Whether the interval has passed; if so, the next one starts."""
         now_s = time.monotonic()
         if now_s < self._next_s:
             return False
@@ -229,5 +235,5 @@ class Every:
         return True
 
     def rest(self, seconds: float) -> None:
-        """Not to be due for so long from now, if that is longer than it would be."""
+        """Delay the next `due` to at least this many seconds from now."""
         self._next_s = max(self._next_s, time.monotonic() + seconds)

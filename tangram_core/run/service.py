@@ -1,4 +1,4 @@
-"""How the processes of a run work together."""
+"""Settings of the service: how the processes of a run work together."""
 
 from dataclasses import dataclass
 
@@ -6,98 +6,107 @@ from tangram_core.run.process import FORMATS
 from tangram_core.settings import Settings, setting
 from tangram_core.wire.addresses import LOCAL, check_host
 
-MOST_ENVS, STEPS = 16, 128  # of service.envs=0: environments, and steps in all their episodes
+MOST_ENVS, STEPS = 16, 128  # for service.envs=0: environments, and steps of all their episodes
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
 
 @dataclass(frozen=True)
 class ServiceConfig(Settings, section="service"):
-    """How the processes work together; the same values serve master and workers."""
+    """Settings of the section `service`, for master and workers."""
 
     bind: str = setting(
         LOCAL,
         "address that the master listens on; local: unix sockets, for processes of the same user "
-        "on its machine",
+        "on the same machine",
     )
     port: int = setting(
         0,
-        "of the master's ROUTER socket; the next one is its PUB socket's; 0: any two free ones",
+        "port of the master, which also takes the next one for broadcasts; 0: any two free ports",
         low=0,
         high=65534,
         unless=ON_SOCKETS,
     )
     host: str = setting(
         "",
-        "name that workers find the master under; empty: bind, or this machine's name for 0.0.0.0",
+        "name or address of the master for workers; empty: bind, or the machine's name if bind is "
+        "0.0.0.0",
         unless=ON_SOCKETS,
     )
     mode: str = setting(
         "async",
-        "nobody waits for anybody, or lockstep: slower, and the same seed gives the same weights",
+        "async: no process waits for another; lockstep: slower, and the same seed gives the same "
+        "weights",
         choices=("async", "lockstep"),
     )
     auth: str = setting(
         "on",
-        "workers need the connection file's keys; off, for tests: whoever reaches the port takes "
-        "part, unencrypted",
+        "on: encrypted, and workers need a key from the connection file; off, for tests: "
+        "unencrypted, and everybody who reaches the port can take part",
         choices=("on", "off"),
         unless=ON_SOCKETS,
     )
     http_bind: str = setting(
-        "127.0.0.1", "address of the master's /metrics and /healthz", unless={"http_port": -1}
+        "127.0.0.1",
+        "address of the master's HTTP pages /metrics and /healthz",
+        unless={"http_port": -1},
     )
     http_port: int = setting(
-        0, "their port, 0 for any free one (see connection.json), -1 for none", low=-1, high=65535
+        0,
+        "port of these pages; 0: any free port, written to connection.json; -1: no pages",
+        low=-1,
+        high=65535,
     )
     publish_seconds: float = setting(
         0.5,
-        "least time between two broadcasts of weights; 0: after every update, as the paper does",
+        "least time between two broadcasts of weights; 0: after every update, as in the paper",
         low=0,
         unit="s",
         only={"mode": "async"},
     )
     envs: int = setting(
         0,
-        "environments that one worker plays at a time; a message holds two episodes of each, fewer "
-        "where they are too large for it. 0: 16, or fewer where episodes are longer than 8 steps, "
-        "so that workers get new weights as often",
+        "environments that one worker plays at a time. A message holds two episodes of each, or "
+        "fewer if they are too large for one message. 0: 16, or fewer if episodes have more than 8 "
+        "steps, so that workers get new weights as often",
         low=0,
         high=512,
     )
     eval_seconds: float = setting(10.0, "least time between two evaluations", low=0, unit="s")
-    eval_episodes: int = setting(100, "fixed test episodes of one evaluation", low=1, high=100_000)
+    eval_episodes: int = setting(
+        100, "test episodes of each evaluation, always the same", low=1, high=100_000
+    )
     log_format: str = setting(
-        "text", "of the lines that processes write: for people or for programs", choices=FORMATS
+        "text", "format of log lines: text for people, json for programs", choices=FORMATS
     )
     checkpoint_minutes: float = setting(5.0, "time between two checkpoints", low=1e-3, unit="min")
     journal_sync_seconds: float = setting(
-        1.0, "time between two syncs of the journal to disk; 0: with each batch", low=0, unit="s"
+        1.0, "time between two syncs of the journal to disk; 0: after each batch", low=0, unit="s"
     )
     # Heartbeats come every two seconds.
     silence_seconds: float = setting(
-        30.0, "after which the master forgets a worker that says nothing", low=3, unit="s"
+        30.0, "time without a message after which the master removes a worker", low=3, unit="s"
     )
-    device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
+    device: str = setting("auto", "torch device of the learner", choices=("auto", "cpu", "cuda"))
     threads: int = setting(
         1,
-        "torch threads of the master; more help on cores that nobody else uses, and are far slower "
-        "than one where another process runs on theirs",
+        "torch threads of the master. More than one is faster on idle cores, and far slower on "
+        "cores that another process uses",
         low=1,
         high=1024,
     )
     compile: bool = setting(
         False,
-        "whether an update is compiled as a whole: minutes at first and seconds later, then an "
-        "update is 1.1 to 2.5 times as fast; needs g++ or clang++. On a GPU it is recorded in "
-        "any case",
+        "compile the whole update. This takes minutes the first time and seconds later, then an "
+        "update is 1.1 to 2.5 times as fast. Needs g++ or clang++. On a GPU updates are always "
+        "recorded as a CUDA graph",
     )
 
     def envs_for(self, horizon: int) -> int:
-        """Environments in which one worker plays episodes of so many steps."""
+        """Number of environments of one worker, for episodes of `horizon` steps."""
         return self.envs or min(MOST_ENVS, max(1, STEPS // horizon))
 
     def batch_episodes(self, horizon: int) -> int:
-        """Episodes of so many steps in one message, where they are not too large for it."""
+        """Number of episodes in one message, unless they are too large for it."""
         return 2 * self.envs_for(horizon)
 
     def __post_init__(self) -> None:

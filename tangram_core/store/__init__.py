@@ -1,1 +1,1 @@
-"""Files: written whole or not at all, and read without trust. Imports tangram_core only."""
+"""Files: written atomically, and checked when read. Imports tangram_core only."""

@@ -1,10 +1,9 @@
-"""Checkpoint folders: written whole or not at all, read with every byte checked.
+"""Checkpoint folders: written completely or not at all, and checked by digests when read.
 
-A checkpoint is a folder named after the number of updates (eight digits, `-1`, `-2`... behind it
-when one of that number exists already) with `manifest.json` and one safetensors file for each
-group of tensors. It is written under a temporary name beside, synced, and renamed, so that a
-folder with a checkpoint's name is complete unless the disk itself lost bytes; those are found by
-the checksums in the manifest.
+A checkpoint is a folder with `manifest.json` and one safetensors file for each group of tensors.
+Its name is the number of updates in eight digits, with `-1`, `-2`... if the name exists already.
+The folder is written under a temporary name, synced, and renamed. So a folder with a checkpoint's
+name is complete, unless the disk lost bytes; the checksums in the manifest find that.
 """
 
 import hashlib
@@ -30,13 +29,13 @@ from tangram_core.wire.arrays import load_tensors
 
 FORMAT_VERSION = 4
 MANIFEST = "manifest.json"
-CHECKPOINTS = "checkpoints"  # the folder of all of them in that of a run
-ACTING = "weights"  # the file of acting weights
-SETUP = "setup"  # the counter that tells the setup
+CHECKPOINTS = "checkpoints"  # folder of the checkpoints in a run's folder
+ACTING = "weights"  # stem of the file with the acting weights
+SETUP = "setup"  # counter that holds `Setup.contents`
 _NAME = re.compile(r"(\d{8,})(?:-(\d+))?")
 _TEMPORARY = ".writing-"
 _SET_ASIDE = ".corrupt"
-_PART = 1 << 24  # bytes after which it is told that the process lives
+_PART = 1 << 24  # bytes between two calls of still_alive
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +43,7 @@ Tensors = dict[str, npt.NDArray[Any]]
 
 
 class _Manifest(TypedDict):
-    """What a manifest says besides its format and its checksum."""
+    """The content of a manifest without its format and checksum."""
 
     updates: Annotated[int, msgspec.Meta(ge=0)]
     files: dict[str, str]
@@ -56,7 +55,7 @@ class DiskError(RunError):
 
 
 class CorruptError(RunError):
-    """A checkpoint that is not as it was written; `why` names the file and what is wrong."""
+    """A checkpoint is damaged; `why` names the file and the fault."""
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"checkpoint {path} is corrupt ({why}): delete it to use the one before")
@@ -65,11 +64,11 @@ class CorruptError(RunError):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What one checkpoint folder holds.
+    """The content of one checkpoint folder.
 
     Attributes:
-        arrays: file stem -> tensor name -> array; only the stems that were asked for.
-        counters: everything that is no tensor, as it was passed to `save_checkpoint`.
+        arrays: file stem -> tensor name -> array, for the stems that were requested.
+        counters: the other values, as passed to `save_checkpoint`.
     """
 
     path: Path
@@ -85,15 +84,15 @@ def save_checkpoint(
     counters: Mapping[str, Any],
     keep: int,
 ) -> Path:
-    """Write a checkpoint and drop all but the newest `keep`.
+    """Write a checkpoint and delete all but the newest `keep`.
 
     Args:
-        folder: holds all checkpoints of a run; made if it is missing, in a folder that is there.
+        folder: folder of all checkpoints of a run; it is created, but its parent must exist.
         arrays: file stem -> tensor name -> array.
         counters: JSON values.
 
     Raises:
-        DiskError: the folder cannot be written; what was there before is as it was.
+        DiskError: the folder cannot be written; earlier checkpoints are not changed.
     """
     aside = folder / f"{_TEMPORARY}{updates:08d}"
     try:
@@ -102,11 +101,11 @@ def save_checkpoint(
         aside.mkdir()
         _write_content(aside, updates, arrays, counters)
         final = _free_name(folder, updates)
-        # From here on it counts; a crash before leaves the older ones as they are.
+        # The rename makes it a checkpoint; a crash before it leaves the older ones unchanged.
         aside.rename(final)
         sync_folder(folder)
     except OSError as error:
-        shutil.rmtree(aside, ignore_errors=True)  # others may need the room
+        shutil.rmtree(aside, ignore_errors=True)  # frees disk space for others
         raise DiskError(
             f"cannot write a checkpoint to {folder} ({error}): make room there or choose another "
             "run_dir"
@@ -116,7 +115,7 @@ def save_checkpoint(
 
 
 def _delete(folders: Iterable[Path]) -> None:
-    """What nobody needs any more; if it cannot be deleted, that is told and no harm."""
+    """Delete folders; one that cannot be deleted is logged and does no harm."""
     for folder in folders:
         try:
             shutil.rmtree(folder)
@@ -125,7 +124,7 @@ def _delete(folders: Iterable[Path]) -> None:
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
-    """The checkpoint folders, oldest first; none where there is no such folder."""
+    """The checkpoint folders, oldest first; empty if the folder does not exist."""
     if not folder.is_dir():
         return []
     found = [path for path in folder.iterdir() if _NAME.fullmatch(path.name) and path.is_dir()]
@@ -133,7 +132,7 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def newest_checkpoint(folder: Path) -> Path:
-    """The newest checkpoint, whether or not its content is whole; RunError if there is none."""
+    """The newest checkpoint, whose content is not checked; RunError if there is none."""
     found = list_checkpoints(folder)
     if not found:
         raise RunError(f"no checkpoint in {folder}: train the run first, or name another run_dir")
@@ -141,11 +140,12 @@ def newest_checkpoint(folder: Path) -> Path:
 
 
 def load_checkpoint(path: Path, stems: Collection[str] | None = None) -> Checkpoint:
-    """Read a checkpoint, or only the named files of it.
+    """Read a checkpoint, or only the files named by `stems`.
 
     Raises:
-        CorruptError: a file is missing or changed; names it.
-        RunError: it cannot be read, is of another format, or never had a named file.
+        CorruptError: a file is missing or damaged; names the file.
+        RunError: the checkpoint cannot be read, has another format, or was written without one of
+            the files.
     """
     manifest = _read_manifest(path)
     names = manifest["files"] if stems is None else stems
@@ -154,7 +154,7 @@ def load_checkpoint(path: Path, stems: Collection[str] | None = None) -> Checkpo
 
 
 def set_aside(path: Path) -> Path:
-    """Rename a corrupt checkpoint, so that it no longer counts as one but is not lost."""
+    """Rename a corrupt checkpoint, so that it is kept but no longer found as a checkpoint."""
     target = path.with_name(path.name + _SET_ASIDE)
     if target.exists():
         shutil.rmtree(target)
@@ -164,7 +164,7 @@ def set_aside(path: Path) -> Path:
 
 
 def was_set_aside(folder: Path) -> bool:
-    """Whether a corrupt checkpoint lies here."""
+    """Whether `set_aside` renamed a checkpoint in this folder."""
     return any(folder.glob(f"*{_SET_ASIDE}"))
 
 
@@ -176,7 +176,7 @@ def _order(path: Path) -> tuple[int, int]:
 
 
 def _free_name(folder: Path, updates: int) -> Path:
-    """An unused name for this number of updates: a full folder cannot be renamed onto."""
+    """An unused name for this number of updates, as a rename cannot replace a full folder."""
     orders = map(_order, list_checkpoints(folder))
     again = max((number for found, number in orders if found == updates), default=-1) + 1
     return folder / (f"{updates:08d}-{again}" if again else f"{updates:08d}")
@@ -190,12 +190,12 @@ def _write_content(
 ) -> None:
     files = {}
     for stem, tensors in arrays.items():
-        # safetensors writes a view's memory as it lies, so the order must be C.
+        # safetensors writes a view's memory unchanged, so the order must be C.
         content = {name: np.asarray(value, order="C") for name, value in tensors.items()}
         data = safetensors.numpy.save(content)
         _write(aside / f"{stem}.safetensors", data)
         files[stem] = hashlib.sha256(data).hexdigest()
-    # Through JSON first: keys become texts, and the reader's digest is of what it can read.
+    # Through JSON first, as keys become texts: the reader's digest is of the same values.
     body = json.loads(json.dumps({"updates": updates, "files": files, "counters": counters}))
     manifest = {"format_version": FORMAT_VERSION, "sha256": _digest(body), **body}
     _write(aside / MANIFEST, json.dumps(manifest, indent=1).encode())

@@ -1,4 +1,4 @@
-"""Writing a file at once, and for good: a reader sees the old content or the new, never a part."""
+"""Atomic, durable writes of files: a reader sees the old content or the new, never a part."""
 
 import os
 import stat
@@ -12,9 +12,13 @@ PUBLIC = 0o644
 
 
 def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True) -> None:
-    """Replace a file, or make it; nothing is left behind when that fails.
+    """Write a file atomically; after an error nothing is left behind.
 
-    With `above` the folders that are missing are made, too.
+    Args:
+        path: the file, new or to be replaced.
+        data: whole content.
+        mode: permissions of the file.
+        above: whether missing folders are created.
 
     Raises:
         RunError: the disk is full or the folder cannot be written.
@@ -41,10 +45,10 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True)
 
 
 def make_folders(folder: Path, above: bool = True) -> None:
-    """Make a folder, and with `above` those above it, with its name on the disk.
+    """Create a folder, and with `above` its missing parents, and sync its name to the disk.
 
     Raises:
-        OSError: that fails.
+        OSError: the folder cannot be created.
     """
     try:
         folder.mkdir(exist_ok=True)
@@ -53,25 +57,25 @@ def make_folders(folder: Path, above: bool = True) -> None:
             raise
         make_folders(folder.parent)
         folder.mkdir(exist_ok=True)
-    # Also where it is there: a kill may have come before the sync. One that may not be read was
-    # made by somebody else.
+    # Also for a folder that exists: a kill may have come before the sync. A parent without
+    # permission to read belongs to another user.
     with suppress(PermissionError):
         sync_folder(folder.parent)
 
 
 def private(path: str, flags: int) -> int:
-    """Opener of a file that only this user may open, also where it was made otherwise."""
+    """Opener for `open`: only this user may access the file, also if it exists already."""
     handle = os.open(path, flags, 0o600)
     os.fchmod(handle, 0o600)
     return handle
 
 
 def check_writable(name: str, path: Path) -> None:
-    """Raise ConfigError, which names the setting, unless `write_whole` could write a file there."""
+    """Raise ConfigError, which names the setting, if `write_whole` cannot write to the path."""
     try:
         if path.is_dir():
             raise IsADirectoryError(0, "it is a folder")
-        _aside(path).exists()  # its name may be too long
+        _aside(path).exists()  # raises if the name is too long
         with TemporaryFile(dir=next(folder for folder in path.parents if folder.exists())):
             pass
     except OSError as error:
@@ -82,10 +86,10 @@ def check_writable(name: str, path: Path) -> None:
 
 
 def own_folder(path: Path) -> None:
-    """Make a folder that only this user may enter, or see that one is there.
+    """Create a folder that only this user may enter, or check an existing one.
 
     Raises:
-        RunError: it can be neither.
+        RunError: the folder cannot be created, or others may enter it.
     """
     try:
         with suppress(FileExistsError):
@@ -99,11 +103,11 @@ def own_folder(path: Path) -> None:
 
 
 def check_own(path: Path) -> None:
-    """See that a folder is one that only this user may enter.
+    """Check that only this user may enter a folder.
 
     Raises:
-        RunError: it is another user's, open to others, or no folder.
-        OSError: it is not there, or cannot be looked at.
+        RunError: it belongs to another user, is open to others, or is no folder.
+        OSError: it does not exist, or its permissions cannot be read.
     """
     found = path.lstat()
     mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
@@ -120,7 +124,7 @@ def _aside(path: Path) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until a folder's names are on the disk: a power cut would undo a rename."""
+    """Sync the names in a folder to the disk; else a power cut could undo a rename."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -129,7 +133,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def is_same(handle: int, path: Path) -> bool:
-    """Whether an open file, or folder, still is what lies under its name."""
+    """Whether a path still names this open file or folder."""
     try:
         return os.path.samestat(os.fstat(handle), path.stat())
     except OSError:

@@ -1,4 +1,4 @@
-"""Settings in files that may come from anybody: bounded before they are built."""
+"""Reading settings from files of strangers: the size is checked before the YAML is built."""
 
 from typing import Any
 
@@ -6,29 +6,29 @@ import yaml
 
 from tangram_core.errors import ConfigError
 
-CONFIG = "config.yaml"  # of a run
-MAX_TEXT = 100_000  # characters: a run's config.yaml has some 3,000
+CONFIG = "config.yaml"  # in a run's folder
+MAX_TEXT = 100_000  # characters; a run's config.yaml has some 3,000
 MAX_VALUES = 10_000
 MAX_DEPTH = 20
 
 
 def load_settings(text: str, source: str) -> Any:
-    """The content of a YAML text; ConfigError if it is none, or more of it than settings are."""
+    """The content of a YAML text; ConfigError if it is not YAML, or larger than settings are."""
     try:
         check_extent(text, source)
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         why = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{source} is not valid YAML ({why}): mend it") from None
+        raise ConfigError(f"{source} is not valid YAML ({why}): correct it") from None
 
 
 def check_extent(text: str, source: str) -> None:
-    """ConfigError for a text of more than so many values, however often its aliases repeat them."""
+    """Raise ConfigError if a YAML text is too large; values that aliases repeat are counted."""
     large = len(text) > MAX_TEXT
     total, sizes, begun = 0, dict[str | None, int](), list[tuple[str | None, int]]()
     for event in () if large else yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
-            # One that stands within what it repeats has no end.
+            # An alias inside the value that it repeats has no end.
             total += sizes.get(event.anchor, MAX_VALUES)
         elif isinstance(event, yaml.CollectionStartEvent):
             begun.append((event.anchor, total))

@@ -1,1 +1,1 @@
-"""How processes reach each other: addresses of sockets. Imports tangram_core only."""
+"""Messages between processes: addresses, arrays, encoding. Imports tangram_core only."""

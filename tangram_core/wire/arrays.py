@@ -1,9 +1,9 @@
-"""Arrays on the wire: raw little-endian frames for episodes and tables, safetensors for weights.
+"""Arrays in messages: raw little-endian frames for episodes and tables, safetensors for weights.
 
-Array frames carry neither shape nor dtype: both follow from the number of rows and from the task
-that sender and receiver agreed on in HELLO. What arrives is checked for its exact size, and every
-value for its bounds; the arrays are read-only. A large array is cut into several frames; decoding
-copies no other.
+Array frames have no shape and no dtype: both follow from the number of rows and from the task that
+sender and receiver agreed on in HELLO. The receiver checks the exact size of a frame and the bounds
+of every value. Decoded arrays are read-only. A large array is cut into several frames; only such an
+array is copied when decoded.
 """
 
 import math
@@ -26,25 +26,25 @@ from tangram_core.spec import EpisodeSpec, Field
 WeightShapes = Mapping[str, tuple[int, ...]]
 
 MAX_EPISODES = 4096
-# Whoever can connect makes the master hold a frame of this size before it has looked at anything.
+# The master must hold one frame of this size from anybody who connects, before it checks anything.
 MAX_FRAME_BYTES = 32 * 1024
 MAX_BATCH_BYTES = 2 * 2**20
 MAX_WEIGHTS_BYTES = 64 * 2**20
 ROUNDING = 1e-6
 _LITTLE = {"f4": "<f4", "u1": "u1"}
 LENGTH = struct.Struct("<I")
-MAX_FRAMES = MAX_BATCH_BYTES // MAX_FRAME_BYTES + 8  # of a message; one for each array is not full
+MAX_FRAMES = MAX_BATCH_BYTES // MAX_FRAME_BYTES + 8  # in a message; some are not full
 
 
 @dataclass(frozen=True)
 class Column:
-    """What one array frame must hold.
+    """Declaration of one array in a message.
 
     Attributes:
-        name: in front of every reason.
-        dtype: little-endian.
-        shape: exact.
-        low, high: bounds of every value, which thereby is finite.
+        name: name of the array, also in errors.
+        dtype: little-endian dtype.
+        shape: exact shape.
+        low, high: finite bounds of every value.
     """
 
     name: str
@@ -55,34 +55,34 @@ class Column:
 
     @cached_property
     def size(self) -> int:
-        """Bytes."""
+        """Size in bytes."""
         return math.prod(self.shape) * np.dtype(self.dtype).itemsize
 
     @cached_property
     def frames(self) -> int:
-        """That it takes."""
+        """Number of frames for the array."""
         return max(1, math.ceil(self.size / MAX_FRAME_BYTES))
 
     @cached_property
     def native(self) -> np.dtype[Any]:
-        """The dtype in the order of this machine."""
+        """The dtype in the byte order of this machine."""
         return np.dtype(self.dtype).newbyteorder("=")
 
     @cached_property
     def bounds(self) -> tuple[float, float]:
-        """Low and high as the dtype has them: what holds before rounding to it holds after."""
+        """Low and high rounded to the dtype, as the values are."""
         return float(self.native.type(self.low)), float(self.native.type(self.high))
 
     def encode(self, array: npt.NDArray[Any]) -> bytes:
-        """The array's frame; WireError for another shape, or a value out of bounds."""
+        """The array as bytes; WireError for another shape, or a value out of bounds."""
         if array.shape != self.shape:
             raise WireError(f"{self.name} must have the shape {self.shape}, got {array.shape}")
-        array = np.ascontiguousarray(array)  # else each of what follows would copy it
+        array = np.ascontiguousarray(array)  # else each step below would copy it
         self._check(array)
         return array.astype(self.dtype, copy=False).tobytes()
 
     def decode(self, frame: bytes) -> npt.NDArray[Any]:
-        """The array in a frame, as a read-only view; WireError as in `encode`."""
+        """A read-only view of the bytes as array; WireError for a wrong size or value."""
         if len(frame) != self.size:
             raise WireError(
                 f"{self.name} must have {self.size} bytes for the shape {self.shape}, "
@@ -95,8 +95,8 @@ class Column:
 
     def _check(self, array: npt.NDArray[Any]) -> None:
         low, high = self.bounds
-        # Extremes of an array with a NaN are NaN, and comparisons with NaN are false. By index they
-        # are found in a fraction of the time of min() and max() where arrays are small.
+        # The extremes of an array with a NaN are NaN, and comparisons with NaN are false. For small
+        # arrays argmin() and argmax() take a fraction of the time of min() and max().
         if array.size == 0 or (
             array.item(array.argmin()) >= low and array.item(array.argmax()) <= high
         ):
@@ -110,29 +110,29 @@ class Column:
 
 @lru_cache
 def columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
-    """The frames of `count` episodes, in the order of the spec's fields."""
+    """The arrays of `count` episodes, in the order of the spec's fields."""
     return tuple(_column(field, (count, *field.rows(spec.horizon))) for field in spec.every)
 
 
 def _column(field: Field, shape: tuple[int, ...]) -> Column:
-    # What is computed in float64 may pass its bounds by rounding to float32.
+    # Rounding a float64 value to float32 may pass its bounds.
     room = 0.0 if field.dtype == "u1" else ROUNDING
     low, high = field.low - room * abs(field.low), field.high + room * abs(field.high)
     return Column(field.name, _LITTLE[field.dtype], shape, low, high)
 
 
 def most_episodes(spec: EpisodeSpec) -> int:
-    """Most episodes in one message, bounded in number and in bytes."""
+    """Largest number of episodes in one message, which has a bound in bytes, too."""
     return min(MAX_EPISODES, MAX_BATCH_BYTES // _bytes(spec))
 
 
 def _bytes(spec: EpisodeSpec) -> int:
-    """Of one episode."""
+    """Size of one episode in bytes."""
     return sum(column.size for column in columns(spec, 1))
 
 
 def check_batch_size(spec: EpisodeSpec, count: int = 1) -> None:
-    """Raise ConfigError if so many episodes cannot be sent in one message."""
+    """Raise ConfigError if `count` episodes are too many for one message."""
     if count > most_episodes(spec):
         raise ConfigError(
             f"{count} episodes of {spec.horizon} steps, {_bytes(spec):,} bytes each, are too many "
@@ -144,7 +144,7 @@ def check_batch_size(spec: EpisodeSpec, count: int = 1) -> None:
 def encode_columns(
     arrays: Mapping[str, npt.NDArray[Any]], columns: Sequence[Column]
 ) -> list[bytes]:
-    """Raw frames of arrays by name; large ones are cut. WireError for what would be refused."""
+    """Raw frames of arrays, large ones cut; WireError if an array breaks its column."""
     whole = [column.encode(arrays[column.name]) for column in columns]
     if all(column.frames == 1 for column in columns):
         return whole
@@ -158,7 +158,7 @@ def encode_columns(
 def decode_columns(
     frames: Sequence[bytes], columns: Sequence[Column]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Arrays by name; WireError for another number of frames, or one that breaks its column."""
+    """Arrays by name; WireError for a wrong number of frames, or if one breaks its column."""
     count = sum(column.frames for column in columns)
     if len(frames) != count:
         raise WireError(f"there must be {count} array frames, got {len(frames)}")
@@ -169,7 +169,7 @@ def decode_columns(
 
 
 def encode_tensors(tensors: Mapping[str, Singles]) -> bytes:
-    """Weights as one frame of safetensors; WireError if they are not finite, or too large."""
+    """Weights as one safetensors frame; WireError if they are not finite, or too large."""
     plain = {name: np.array(t, np.float32, order="C") for name, t in tensors.items()}
     _check_finite(plain)
     data = save(plain)
@@ -181,10 +181,14 @@ def encode_tensors(tensors: Mapping[str, Singles]) -> bytes:
 
 
 def decode_tensors(frame: bytes, shapes: WeightShapes | None) -> dict[str, Singles]:
-    """The tensors in a frame made by `encode_tensors`, of these shapes; None takes any.
+    """The tensors in a frame of `encode_tensors`.
+
+    Args:
+        frame: the frame.
+        shapes: tensor name -> shape that it must have; None: any tensors.
 
     Raises:
-        WireError: names the tensor and what is wrong with it.
+        WireError: names the tensor and the fault.
     """
     if len(frame) > MAX_WEIGHTS_BYTES:
         raise WireError(f"weights: {len(frame)} bytes, at most {MAX_WEIGHTS_BYTES}")
@@ -203,10 +207,10 @@ def decode_tensors(frame: bytes, shapes: WeightShapes | None) -> dict[str, Singl
 
 
 def load_tensors(data: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
-    """The tensors in data of safetensors; WireError, which begins with the name, if it is none."""
+    """The tensors in safetensors data; WireError, which begins with `name`, for other data."""
     try:
         return load(data)
-    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
+    # KeyError: a dtype unknown to numpy; ValueError: a shape beyond numpy's limits.
     except (SafetensorError, KeyError, ValueError) as error:
         raise WireError(f"{name}: not safetensors: {error}") from None
 
@@ -218,12 +222,12 @@ def _check_finite(tensors: dict[str, npt.NDArray[Any]]) -> None:
 
 
 def join_frames(frames: Iterable[bytes]) -> bytes:
-    """Several frames as one piece of data: each behind its length (u32)."""
+    """Join frames into one; in front of each is its length (u32)."""
     return b"".join(part for frame in frames for part in (LENGTH.pack(len(frame)), frame))
 
 
 def split_frames(data: bytes) -> list[bytes]:
-    """What `join_frames` joined; WireError if a frame is cut short, or there are too many."""
+    """Split the result of `join_frames`; WireError if a frame is incomplete, or for too many."""
     frames, start = list[bytes](), 0
     while start < len(data):
         if len(frames) == MAX_FRAMES:

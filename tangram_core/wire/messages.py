@@ -4,7 +4,7 @@ To add a field, add one line to its class; to add a message, write its class and
 or ToWorker.
 
 Delivery: batches are numbered from 1 within an incarnation and sent in order, at least once. The
-master acknowledges a batch after its insert, takes them in order, and drops what it had before.
+master takes them in order, acknowledges a batch after its insert, and drops duplicates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,16 +52,16 @@ MAX_RUN_ID = 256
 MAX_ADDRESS = 256
 MAX_SEED = 2**63 - 1
 MAX_INDEX = 65_535
-WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pauses play
+WINDOW = 4  # most unacknowledged messages of a worker; play pauses when they are reached
 MAX_WINDOW = 1024
-PICTURE_WIDTH, PICTURE_HEIGHT = 1024, 768  # pixels: at most, they fill MAX_FRAMES
+PICTURE_WIDTH, PICTURE_HEIGHT = 1024, 768  # pixels; the largest picture fills MAX_FRAMES
 MAX_ROWS = 4096
 TAKEN_OVER = "was taken over by a newer process"  # tangram-train reads it in a worker's log
 OPEN = "service.auth=off: open to whoever reaches the port"
 
 
 class BatchError(WireError):
-    """An intact batch, of this number, whose content is refused: it would be wrong again."""
+    """A batch that arrived undamaged has wrong content; sending it again would not help."""
 
     def __init__(self, sequence: int, reason: str) -> None:
         super().__init__(reason)
@@ -70,7 +70,7 @@ class BatchError(WireError):
 
 Count = Annotated[int, Between(0)]
 Number = Annotated[int, Between(1)]
-Version = Annotated[int, Between(-1)]  # of weights, -1 for none
+Version = Annotated[int, Between(-1)]  # version of weights; -1: no weights
 Index = Annotated[int, Between(0, MAX_INDEX)]
 Role = Annotated[str, Text(choices=ROLES)]
 Id = Annotated[str, Text(MAX_ID)]
@@ -84,16 +84,16 @@ YesOrNo = Annotated[bool, Flag()]
 
 @dataclass(frozen=True)
 class Hello(Message):
-    """A process asks to take part, or to go on after it lost the master.
+    """A process asks to take part, or to go on after the connection was lost.
 
     Attributes:
-        role: player or evaluator; each role counts its own indices.
-        index: wanted, or -1 for any.
-        incarnation: 0 for a new process, else the one that the master gave it.
-        process: random id of the process, the same in each of its HELLOs.
-        first: number of the oldest batch that it may still send.
+        role: player or evaluator; indices are counted for each role.
+        index: the wanted index, or -1 for any.
+        incarnation: 0 for a new process, else the one that the master gave.
+        process: random id of the process, the same in all HELLOs of the process.
+        first: number of the oldest batch that may still be sent.
         fingerprints: section of the settings -> digest.
-        run_id: of the run that it wants to take part in, empty where it knows an address only.
+        run_id: id of the wanted run; empty if the process knows only an address.
     """
 
     kind: ClassVar[str] = "hello"
@@ -108,7 +108,7 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class WantWeights(Message):
-    """A worker asks for the current weights unless they are of this epoch and version."""
+    """A worker asks for the newest weights, unless it has these: its epoch and version."""
 
     kind: ClassVar[str] = "want_weights"
     epoch: Id
@@ -133,14 +133,14 @@ class Bye(Message):
 
 @dataclass(frozen=True)
 class AskStatus(Message):
-    """Anybody asks how the run stands; no HELLO is needed."""
+    """Anybody asks for the status of the run; no HELLO is needed."""
 
     kind: ClassVar[str] = "ask_status"
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeBatch(Table):
-    """Whole episodes as played, numbered from 1 within an incarnation; version -1: no weights."""
+    """Whole episodes; batches are numbered from 1 within an incarnation; version -1: no weights."""
 
     kind: ClassVar[str] = "episodes"
     sequence: Number
@@ -149,21 +149,21 @@ class EpisodeBatch(Table):
 
     @classmethod
     def rows(cls, agreed: EpisodeSpec) -> Between:
-        """Bounded in number and in bytes."""
+        """Bounds of the number of episodes."""
         return Between(1, most_episodes(agreed))
 
     @classmethod
     def columns(cls, agreed: EpisodeSpec, count: int) -> Sequence[Column]:
-        """One for each field of the spec."""
+        """One column for each field of the spec."""
         return columns(agreed, count)
 
     def arrays(self) -> Mapping[str, Any]:
-        """Those of the episodes."""
+        """The arrays of the episodes."""
         return self.episodes.arrays
 
     @classmethod
     def refused(cls, header: Mapping[str, Any], error: WireError) -> WireError:
-        """With the batch's number, where it has one."""
+        """A BatchError with the number of the batch, if the header has one."""
         sequence = header.get("sequence")
         if type(sequence) is int and 1 <= sequence <= MAX_COUNT:
             return BatchError(sequence, str(error))
@@ -171,7 +171,7 @@ class EpisodeBatch(Table):
 
     @classmethod
     def filled(cls, values: dict[str, Any], arrays: dict[str, Any]) -> Self:
-        """With the arrays as episodes."""
+        """The message with the arrays as episodes."""
         return cls(**values, episodes=Episodes(arrays))
 
 
@@ -180,9 +180,9 @@ class Scores(Table):
     """Results of one evaluation.
 
     Attributes:
-        weights_version: of the weights that were tested.
+        weights_version: version of the tested weights.
         scalars: name -> value.
-        picture: (H, PICTURE_WIDTH, 3) of a few test episodes, H = 0 where none was drawn.
+        picture: (H, PICTURE_WIDTH, 3) of a few test episodes; H = 0: no picture.
     """
 
     kind: ClassVar[str] = "scores"
@@ -192,34 +192,34 @@ class Scores(Table):
 
     @classmethod
     def rows(cls, _agreed: EpisodeSpec) -> Between:
-        """Enough to look at."""
+        """Bounds of the height of the picture."""
         return Between(0, PICTURE_HEIGHT)
 
     @classmethod
     def columns(cls, _agreed: EpisodeSpec, count: int) -> Sequence[Column]:
-        """The picture, row by row."""
+        """One column for the picture."""
         return [Column("picture", "u1", (count, PICTURE_WIDTH, 3), 0, 255)]
 
 
 @dataclass(frozen=True)
 class Welcome(Message):
-    """The master takes a process in.
+    """The master accepts a process.
 
     Attributes:
-        epoch: random id of this life of the master.
-        run_id: of the run.
-        seed: of the run, from which workers derive theirs.
-        index: of the process within its role.
-        incarnation: of the process within its index, from 1.
-        weights_endpoint: of the PUB socket.
-        window: most batches that the master accepts unacknowledged.
-        lockstep: play only what Go says.
+        epoch: random id of the master process; a restarted master has a new one.
+        run_id: id of the run.
+        seed: seed of the run, from which workers derive their seeds.
+        index: index of the process within its role.
+        incarnation: incarnation of the process within its index, from 1.
+        weights_endpoint: address of the PUB socket.
+        window: most unacknowledged batches that the master accepts.
+        lockstep: whether to play only the episodes that Go orders.
     """
 
     kind: ClassVar[str] = "welcome"
     epoch: Id
     run_id: RunId
-    seed: Annotated[int, Between(0, MAX_SEED)]  # the user's own, and nothing counts on from it
+    seed: Annotated[int, Between(0, MAX_SEED)]  # given by the user, and never incremented
     index: Index
     incarnation: Number
     weights_endpoint: Annotated[str, Text(MAX_ADDRESS)]
@@ -229,13 +229,13 @@ class Welcome(Message):
 
 @dataclass(frozen=True)
 class Go(Message):
-    """In lockstep, what a player plays next; it may come more than once.
+    """In lockstep, the episodes that a player plays next; may be sent more than once.
 
     Attributes:
-        number: of the round.
-        version: of the weights to play with.
-        first_episode: number of the first episode, from which its generator follows.
-        episodes: how many, in one batch.
+        number: number of the round.
+        version: version of the weights to play with.
+        first_episode: number of the first episode, which determines its generator.
+        episodes: number of episodes, sent in one batch.
     """
 
     kind: ClassVar[str] = "go"
@@ -247,11 +247,11 @@ class Go(Message):
 
 @dataclass(frozen=True)
 class Refused(Message):
-    """The master does not take a process in.
+    """The master does not accept a process.
 
     Attributes:
-        reason: why.
-        later: it may, when others have left.
+        reason: reason in words.
+        later: whether it may be accepted when others have left.
     """
 
     kind: ClassVar[str] = "refused"
@@ -261,14 +261,14 @@ class Refused(Message):
 
 @dataclass(frozen=True)
 class Greet(Message):
-    """The master does not know this connection (it was restarted): say HELLO again."""
+    """The master does not know this connection, for example after a restart: say HELLO again."""
 
     kind: ClassVar[str] = "greet"
 
 
 @dataclass(frozen=True)
 class Ack(Message):
-    """A batch is in the replay, now or since before (duplicate)."""
+    """A batch is in the replay buffer; duplicate: it was there before."""
 
     kind: ClassVar[str] = "ack"
     sequence: Number
@@ -280,10 +280,10 @@ class Reject(Message):
     """A message is refused.
 
     Attributes:
-        reason: why.
-        sequence: of the batch, 0 where the message had none, or none to believe.
-        final: the message itself is wrong and must not be sent again; else it came out of turn, or
-            was damaged on its way.
+        reason: reason in words.
+        sequence: number of the batch; 0 if the message had none, or was damaged.
+        final: true: the content is wrong and must not be sent again; false: the message came out of
+            order, or was damaged in transit.
     """
 
     kind: ClassVar[str] = "reject"
@@ -294,7 +294,7 @@ class Reject(Message):
 
 @dataclass(frozen=True)
 class Alive(Message):
-    """The answer to a heartbeat, by whose version one that missed the newest broadcast can ask."""
+    """The answer to a heartbeat; a worker with an older version asks for the newest weights."""
 
     kind: ClassVar[str] = "alive"
     version: Version
@@ -318,7 +318,7 @@ class WeightsMessage(Message):
 
     @classmethod
     def described(cls, _agreed: Any) -> Mapping[str, Bound]:
-        """Their version."""
+        """Bounds of the version of the weights."""
         return {"version": Between(0)}
 
     def pack(self, _agreed: Any) -> tuple[Mapping[str, int], list[bytes]]:
@@ -329,7 +329,7 @@ class WeightsMessage(Message):
     def unpack(
         cls, values: dict[str, Any], frames: Sequence[bytes], agreed: WeightShapes | None
     ) -> Self:
-        """The message, if the tensors have the shapes that a worker agreed on."""
+        """The message; WireError unless the tensors have the agreed shapes."""
         check_frames(cls.kind, frames, 1)
         weights = Weights(values.pop("version"), decode_tensors(frames[0], agreed))
         return cls(**values, weights=weights)
@@ -339,23 +339,23 @@ WORKER_COLUMNS = (
     "evaluator",  # 1, or 0 for a player
     "index",
     "incarnation",
-    "silent_s",  # since its last message
-    "behind",  # updates since the weights that its last batch was played with; -1 before one
-    "batches",  # since it joined
+    "silent_s",  # seconds since the last message
+    "behind",  # updates since the weights of the last batch; -1 before the first batch
+    "batches",  # since it joined, as the next two
     "episodes",
     "transitions",
-    "waiting",  # batches that are not acknowledged yet
+    "waiting",  # batches without acknowledgement
 )
 
 
 @dataclass(frozen=True, eq=False)
 class RunStatus(Table):
-    """How a run stands. What a receiver would refuse is left out or cut, see Numbers.
+    """Status of a run. Entries that a receiver would refuse are left out or cut, see Numbers.
 
     Attributes:
         numbers: name -> value.
-        texts: name -> text: what it does or waits for, and who it is.
-        workers: (P, 9) float64, a row for each process; see WORKER_COLUMNS.
+        texts: name -> text, such as the current activity and the id of the run.
+        workers: (P, 9) float64, a row for each of P processes; see WORKER_COLUMNS.
     """
 
     kind: ClassVar[str] = "status"
@@ -370,12 +370,12 @@ class RunStatus(Table):
 
     @classmethod
     def rows(cls, _agreed: Any) -> Between:
-        """As many as there may be workers."""
+        """Bounds of the number of processes."""
         return Between(0, MAX_ROWS)
 
     @classmethod
     def columns(cls, _agreed: Any, count: int) -> Sequence[Column]:
-        """The table of workers."""
+        """One column for the table of processes."""
         return [Column("workers", "<f8", (count, len(WORKER_COLUMNS)), -1.0, MAX_NUMBER)]
 
 
@@ -387,27 +387,27 @@ ToWorker = Welcome | Go | Refused | Greet | Ack | Reject | Alive | Stop | Weight
 
 
 def decode_from_worker(frames: Sequence[bytes], spec: EpisodeSpec) -> ToMaster:
-    """A worker's message.
+    """Decode a message from a worker.
 
     Args:
-        frames: without the identity.
-        spec: the task that arrays must belong to.
+        frames: the frames without the identity.
+        spec: spec of the task, which arrays must match.
 
     Raises:
         ProtocolError: the worker speaks another version.
-        DamagedError: the message was changed on its way.
-        BatchError: a numbered batch with wrong content.
-        WireError: anything else that is wrong; the reason names the field.
+        DamagedError: the message was damaged in transit.
+        BatchError: a numbered batch has wrong content.
+        WireError: any other fault; the reason names the field.
     """
     return cast("ToMaster", received(frames, _FROM_WORKER, spec))
 
 
 def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> ToWorker:
-    """The master's message.
+    """Decode a message from the master.
 
     Args:
-        frames: all of it.
-        shapes: of the tensors that weights must have; None takes any.
+        frames: all frames.
+        shapes: tensor name -> shape that weights must have; None: any.
 
     Raises:
         WireError: as in `decode_from_worker`.
@@ -416,7 +416,7 @@ def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> 
 
 
 def decode_weights(frame: bytes, shapes: WeightShapes | None) -> tuple[str, Weights]:
-    """The master's epoch and its weights, from a broadcast; errors as in `decode_from_master`."""
+    """The master's epoch and weights from a broadcast; errors as in `decode_from_master`."""
     frames = split_frames(frame)
     message = read(WeightsMessage, opened(frames), frames[1:], shapes)
     return message.epoch, message.weights

@@ -1,13 +1,13 @@
-"""How messages are declared, sealed with a checksum, and read; the messages are in `messages`.
+"""Declaration, checksum and reading of messages; the messages themselves are in `messages`.
 
-A message is a frozen dataclass. Each field's annotation carries its bound, by which it is checked
-before it is sent and when it is read, in either direction, by the one reader here.
+A message is a frozen dataclass. Each field's annotation has the bound of the field. Fields are
+checked before sending and after receiving, in both directions, by the same code.
 
-On the wire a message is a list of frames: a small msgpack map {v, kind, fields..., crc}, then raw
-arrays (`arrays`). `crc` is the CRC-32 of the map without its last four bytes, which hold it, and of
-all frames after it. It is checked before anything is decoded, in every message: a damaged
-acknowledgement would lose a batch just as a damaged batch would. It stands in the map, whose first
-key stays the version, so that another version of the protocol is told from damage.
+A message is sent as a list of frames: first the header, a small msgpack map {v, kind, fields...,
+crc}, then raw arrays (`arrays`). `crc` is the CRC-32 of all frames without the last four bytes of
+the header, which hold it. It is checked before anything is decoded, in every message: a damaged
+acknowledgement would lose a batch just like a damaged batch. The version is always the first key
+of the header, so that another version of the protocol is not mistaken for damage.
 """
 
 import math
@@ -27,47 +27,47 @@ PROTOCOL = 9
 MAX_HEADER = 16 * 1024
 MAX_KIND = 32
 MAX_TEXT = 1024
-MAX_TEXTS = 8 * 1024  # bytes of all texts of a lenient map
+MAX_TEXTS = 8 * 1024  # bytes of all texts in a lenient map
 MAX_ENTRIES = 64
-MAX_COUNT = 2**53  # up to here a float64 holds every integer
+MAX_COUNT = 2**53  # a float64 holds every integer up to this
 MAX_NUMBER = 1e18
 NAME = re.compile(r"[a-z0-9_./]{1,64}")
 CHECKSUM = 4  # bytes at the end of a header
-MARK = b"\xa3crc\xce"  # before them: the key, and msgpack's sign for 32 bits
+MARK = b"\xa3crc\xce"  # bytes before the checksum: the key, and msgpack's type byte for 32 bits
 
 
 class ProtocolError(WireError):
-    """The other side speaks another version of the protocol."""
+    """The peer uses another version of the protocol."""
 
 
 class DamagedError(WireError):
-    """The checksum is not that of the message: nothing in it, not even its number, is believed."""
+    """The checksum does not match the message: no field of it can be used."""
 
 
 # Bounds of fields
 
 
 class Bound:
-    """What a field may hold."""
+    """Base of the bounds of a field."""
 
     def check(self, where: str, value: Any) -> Any:
-        """The value as a message holds it; WireError if it must not be sent or taken."""
+        """The checked value; WireError, which begins with `where`, if it is out of bounds."""
         raise NotImplementedError
 
     def fit(self, value: Any) -> Any:
-        """The value brought within bounds, where that hides no mistake."""
+        """The value clipped or cut to the bounds if that hides no mistake; else unchanged."""
         return value
 
 
 @dataclass(frozen=True)
 class Between(Bound):
-    """An integer."""
+    """An integer from low to high."""
 
     low: int
     high: int = MAX_COUNT
 
     def check(self, where: str, value: Any) -> int:
-        """An int, and no bool."""
+        """The checked integer; a bool is refused."""
         if type(value) is not int or not self.low <= value <= self.high:
             raise _wrong(where, f"an integer between {self.low} and {self.high}", value)
         return value
@@ -75,17 +75,17 @@ class Between(Bound):
 
 @dataclass(frozen=True)
 class Flag(Bound):
-    """True or false."""
+    """A bool."""
 
     def check(self, where: str, value: Any) -> bool:
-        """A bool, and no 0 or 1."""
+        """The checked bool; 0 and 1 are refused."""
         if not isinstance(value, bool):
             raise _wrong(where, "true or false", value)
         return value
 
 
 def plain(text: str) -> str:
-    """A text from a peer, with what a terminal would obey written out: an escape as `x1b`."""
+    """The text of a peer with control characters escaped, as they could change a terminal."""
     if text.isprintable():
         return text
     return "".join(
@@ -95,12 +95,13 @@ def plain(text: str) -> str:
 
 @dataclass(frozen=True)
 class Text(Bound):
-    """A text of at most so many characters, one of the choices if there are any; it comes `plain`.
+    """A text of limited length; control characters are escaped by `plain`.
 
     Attributes:
         longest: most characters.
-        needed: it must not be empty.
-        cut: longer ones are cut to so many bytes, and what UTF-8 has not is replaced.
+        choices: allowed texts; empty: any text.
+        needed: whether an empty text is refused.
+        cut: whether `fit` cuts the text to `longest` bytes and replaces invalid characters.
     """
 
     longest: int = MAX_TEXT
@@ -109,7 +110,7 @@ class Text(Bound):
     cut: bool = False
 
     def check(self, where: str, value: Any) -> str:
-        """A text within the bounds."""
+        """The checked text, made `plain`."""
         if not isinstance(value, str) or len(value) > self.longest:
             raise _wrong(where, f"a text of at most {self.longest} characters", value)
         if self.choices and value not in self.choices:
@@ -119,7 +120,7 @@ class Text(Bound):
         return plain(value)
 
     def fit(self, value: Any) -> Any:
-        """The text, cut if it may be."""
+        """The text, cut if `cut` is set."""
         return _cut(value, self.longest) if self.cut else value
 
 
@@ -128,28 +129,28 @@ class Numbers(Bound):
     """A map from names to finite numbers.
 
     Attributes:
-        lenient: what does not fit is left out or brought to the nearest bound: these numbers are
-            for people to look at, and must not end the loop that tells them.
+        lenient: whether `fit` clips numbers and leaves out other entries. These numbers are only
+            shown to people, so a wrong one must not stop the process.
     """
 
     lenient: bool = False
 
     def check(self, where: str, value: Any) -> dict[str, float]:
-        """All as floats."""
+        """The checked map, all numbers as floats."""
         for key, number in _entries(where, value):
             known = isinstance(number, int | float) and not isinstance(number, bool)
-            if not (known and -MAX_NUMBER <= number <= MAX_NUMBER):  # nor NaN
+            if not (known and -MAX_NUMBER <= number <= MAX_NUMBER):  # false for NaN
                 raise _wrong(f"{where}.{key}", "a finite number", number)
         return {key: float(number) for key, number in value.items()}
 
     def fit(self, value: Any) -> Any:
-        """All as floats, in a lenient map those that fit."""
+        """The map with all numbers as floats; if lenient, clipped and without other entries."""
         if not self.lenient:
             return {key: float(number) for key, number in value.items()}
         known: dict[str, Any] = {
             k: v for k, v in value.items() if _is_name(k) and isinstance(v, Real)
         }
-        # An integer may be too large for a float; NaN stays what it is between any two bounds.
+        # An integer may be too large for a float; min and max keep NaN.
         near = {k: float(min(max(v, -MAX_NUMBER), MAX_NUMBER)) for k, v in known.items()}
         fitted = [(k, v) for k, v in near.items() if not math.isnan(v)]
         return dict(fitted[:MAX_ENTRIES])
@@ -157,18 +158,18 @@ class Numbers(Bound):
 
 @dataclass(frozen=True)
 class Texts(Bound):
-    """A map from names to texts of at most so many characters; `lenient` as in Numbers."""
+    """A map from names to texts of at most `longest` characters; `lenient` as in Numbers."""
 
     longest: int
     lenient: bool = False
 
     def check(self, where: str, value: Any) -> dict[str, str]:
-        """A plain dict."""
+        """The checked map as a dict."""
         text = Text(self.longest)
         return {key: text.check(f"{where}.{key}", one) for key, one in _entries(where, value)}
 
     def fit(self, value: Any) -> Any:
-        """In a lenient map as many as there is room for, cut."""
+        """The map; if lenient, texts are cut to the limits and other entries left out."""
         if not self.lenient:
             return value
         fitted, room = dict[str, str](), MAX_TEXTS
@@ -187,10 +188,13 @@ Kind = TypeVar("Kind", bound="Message")
 
 
 class Message:
-    """What all messages share: fields with bounds, and perhaps arrays after them."""
+    """Base of messages: fields with bounds, and optional arrays.
+
+    `agreed` is what both sides know of the arrays: the spec of the task or the weight shapes.
+    """
 
     kind: ClassVar[str]
-    bounds: ClassVar[Mapping[str, Bound]]  # of the fields that carry one, in their order
+    bounds: ClassVar[Mapping[str, Bound]]  # field -> bound, in the order of the fields
     _fitted: ClassVar[Mapping[str, Bound]]
 
     def __init_subclass__(cls) -> None:
@@ -205,42 +209,42 @@ class Message:
 
     @classmethod
     def described(cls, _agreed: Any) -> Mapping[str, Bound]:
-        """Header fields that describe the arrays, for a receiver that agreed on a task."""
+        """Bounds of the header fields that describe the arrays."""
         return {}
 
     @classmethod
     def refused(cls, _header: Mapping[str, Any], error: WireError) -> WireError:
-        """What is raised for an intact message whose content is wrong."""
+        """The error to raise for an undamaged message with wrong content."""
         return error
 
     def pack(self, _agreed: Any) -> tuple[Mapping[str, int], list[bytes]]:
-        """What describes the arrays, and their frames."""
+        """Header fields that describe the arrays, and the frames of the arrays."""
         return {}, []
 
     @classmethod
     def unpack(cls, values: dict[str, Any], frames: Sequence[bytes], _agreed: Any) -> Self:
-        """The message of checked fields and of the frames after the header."""
+        """Make the message from checked fields and the frames after the header."""
         check_frames(cls.kind, frames, 0)
         return cls(**values)
 
     def encode(self, agreed: Any = None) -> list[bytes]:
-        """The message's frames, of arrays as agreed on; WireError for what would be refused."""
+        """The frames of the message; WireError if a value is out of bounds."""
         more, arrays = self.pack(agreed)
         values = {name: getattr(self, name) for name in self.bounds}
         return seal(self.kind, _checked(type(self), {**values, **more}, agreed), arrays)
 
 
 class Table(Message):
-    """A message with arrays of so many rows, named by their columns."""
+    """Base of messages with arrays that all have the same number of rows."""
 
     @classmethod
     def rows(cls, agreed: Any) -> Between:
-        """How many there may be."""
+        """Bounds of the number of rows."""
         raise NotImplementedError
 
     @classmethod
     def columns(cls, agreed: Any, count: int) -> Sequence[Column]:
-        """What the frames of so many rows must hold."""
+        """The columns of arrays with `count` rows."""
         raise NotImplementedError
 
     def arrays(self) -> Mapping[str, Any]:
@@ -249,24 +253,24 @@ class Table(Message):
 
     @classmethod
     def described(cls, agreed: Any) -> Mapping[str, Bound]:
-        """Their number."""
+        """The bounds of `count`, the number of rows."""
         return {"count": cls.rows(agreed)}
 
     def pack(self, agreed: Any) -> tuple[Mapping[str, int], list[bytes]]:
-        """One raw frame per column."""
+        """The number of rows, and the raw frames of the columns."""
         arrays = self.arrays()
         count = len(arrays[self.columns(agreed, 1)[0].name])
         return {"count": count}, encode_columns(arrays, self.columns(agreed, count))
 
     @classmethod
     def unpack(cls, values: dict[str, Any], frames: Sequence[bytes], agreed: Any) -> Self:
-        """The message with its arrays, which are views of the frames."""
+        """The message with its arrays, as views of the frames if possible."""
         count = values.pop("count")
         return cls.filled(values, decode_columns(frames, cls.columns(agreed, count)))
 
     @classmethod
     def filled(cls, values: dict[str, Any], arrays: dict[str, Any]) -> Self:
-        """The message of its header fields and its arrays."""
+        """Make the message from header fields and arrays."""
         return cls(**values, **arrays)
 
 
@@ -278,7 +282,7 @@ def by_kind(union: Any) -> dict[str, type[Message]]:
 def read(
     cls: type[Kind], header: Mapping[str, Any], frames: Sequence[bytes] = (), agreed: Any = None
 ) -> Kind:
-    """The message of an opened header and the frames after it; WireError names the wrong field."""
+    """Make a message from a header of `opened` and its frames; WireError names a wrong field."""
     if header["kind"] != cls.kind:
         raise WireError(f"expected {cls.kind}, got a message of kind {header['kind']!r}")
     values = {name: value for name, value in header.items() if name != "kind"}
@@ -286,7 +290,7 @@ def read(
 
 
 def received(frames: Sequence[bytes], kinds: Mapping[str, type[Message]], agreed: Any) -> Message:
-    """The message in these frames, of one of these kinds; errors as in `opened` and `read`."""
+    """Read a message of one of these kinds; errors as in `opened` and `read`."""
     header = opened(frames)
     cls = kinds.get(header["kind"])
     if cls is None:
@@ -298,14 +302,14 @@ def received(frames: Sequence[bytes], kinds: Mapping[str, type[Message]], agreed
 
 
 def check_frames(kind: str, frames: Sequence[bytes], count: int) -> None:
-    """Raise WireError unless there are so many frames after the header."""
+    """Raise WireError unless `count` frames follow the header."""
     if len(frames) != count:
         many = "1 frame" if not count else f"{1 + count} frames"
         raise WireError(f"{kind}: there must be {many}, got {1 + len(frames)}")
 
 
 def _checked(cls: type[Message], values: dict[str, Any], agreed: Any) -> dict[str, Any]:
-    """All header fields and no others, each within its bound."""
+    """The checked header fields; missing and unknown ones are refused."""
     bounds = {**cls.bounds, **cls.described(agreed)}
     if values.keys() != bounds.keys():
         for name in bounds:
@@ -318,8 +322,8 @@ def _checked(cls: type[Message], values: dict[str, Any], agreed: Any) -> dict[st
 
 
 def seal(kind: str, fields: Mapping[str, object], frames: Sequence[bytes]) -> list[bytes]:
-    """The header {v, kind, fields..., crc} and the frames; WireError if it is too large."""
-    largest = 2**32 - 1  # packed at the length of every checksum above 2^16
+    """Put the header {v, kind, fields..., crc} before frames; WireError if it is too large."""
+    largest = 2**32 - 1  # packed in 32 bits, which the checksum replaces
     header: bytes = msgpack.packb({"v": PROTOCOL, "kind": kind, **fields, "crc": largest})
     if len(header) > MAX_HEADER:
         raise WireError(f"{kind}: the header has {len(header)} bytes, at most {MAX_HEADER}")
@@ -328,12 +332,12 @@ def seal(kind: str, fields: Mapping[str, object], frames: Sequence[bytes]) -> li
 
 
 def opened(frames: Sequence[bytes]) -> dict[str, Any]:
-    """The kind and the fields of a header whose checksum holds, each still to be checked.
+    """The header of a message after its checksum is verified; the fields are not checked yet.
 
     Raises:
-        ProtocolError: another version.
-        DamagedError: the checksum is not that of the message.
-        WireError: too large, or not a header.
+        ProtocolError: the peer uses another version of the protocol.
+        DamagedError: the checksum does not match the message.
+        WireError: the header is too large, or no header.
     """
     if not frames:
         raise WireError("the message is empty")
@@ -342,7 +346,7 @@ def opened(frames: Sequence[bytes]) -> dict[str, Any]:
         raise WireError(f"the header has {len(header)} bytes, at most {MAX_HEADER}")
     body, sent = header[:-CHECKSUM], header[-CHECKSUM:]
     if not body.endswith(MARK):
-        # Neither a message of this version nor one that was damaged behind its header.
+        # A message of another version, or one with a damaged header.
         _check_version(_unpacked(header))
         raise DamagedError("the message is damaged: it has no checksum")
     found = checksum(body, frames[1:])
@@ -357,7 +361,7 @@ def opened(frames: Sequence[bytes]) -> dict[str, Any]:
 
 
 def checksum(body: bytes, frames: Sequence[bytes]) -> int:
-    """CRC-32 of a header without its own checksum, and of the frames after it."""
+    """CRC-32 of a header without its checksum, and of the frames after it."""
     found = zlib.crc32(body)
     for frame in frames:
         found = zlib.crc32(frame, found)
@@ -418,7 +422,7 @@ def _is_name(key: Any) -> bool:
 
 
 def _cut(text: str, size: int) -> str:
-    """At most so many bytes of UTF-8."""
+    """The text cut to at most `size` bytes of UTF-8."""
     return text.encode(errors="replace")[:size].decode(errors="ignore")
 
 
@@ -427,7 +431,7 @@ def _wrong(where: str, wanted: str, value: object) -> WireError:
 
 
 def _shown(value: object) -> str:
-    """A short form that is safe in a log: quoted, and never a nested structure."""
+    """A short form that is safe in a log: quoted text, and only the type of a structure."""
     if isinstance(value, str):
         return repr(value if len(value) <= 40 else value[:40] + "...")
     if value is None or isinstance(value, bool | int | float):

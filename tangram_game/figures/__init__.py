@@ -1,5 +1,5 @@
-"""What a finished agent is to assemble: puzzles, photographs, silhouettes, hidden pieces.
+"""Targets for a finished agent: puzzles, photographs and silhouettes.
 
-Start with `puzzles.py`. `methods.py` says how a silhouette is filled. May import
+Start with `puzzles.py`. `targets.py` finds the kind of a target. May import
 tangram_game.show.
 """

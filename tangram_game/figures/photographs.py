@@ -1,4 +1,4 @@
-"""A photograph as what a run is to assemble: its tokens are found, outlined and played."""
+"""A photograph as a target: its tokens are found, outlined, and assembled by the run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +20,12 @@ if TYPE_CHECKING:  # needs OpenCV
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """What a photograph shows.
+    """A photograph and the tokens found in it.
 
     Attributes:
-        given: its picture.
-        outlines: (V, 2) corners of the tokens, pixels of the picture, y down.
-        figure: the tokens in the middle of a run's arena.
+        given: the picture.
+        outlines: (V, 2) corners of the tokens in pixels of the picture, y down.
+        figure: the tokens, moved to the middle of the run's arena.
     """
 
     given: "Given"
@@ -34,12 +34,12 @@ class Photograph:
 
 
 def read_photograph(target: str, task: Place, anywhere: bool = False) -> Photograph:
-    """What a file shows of a run's tokens, in its arena or anywhere.
+    """Find a run's tokens in a photograph; with `anywhere` they may reach out of the arena.
 
     Raises:
-        ConfigError: says what was found instead.
+        ConfigError: not all tokens are found; the text says what is.
     """
-    # Only here: other targets need no OpenCV. Without it nothing is a photograph.
+    # Imported here: other targets need no OpenCV.
     from tangram_vision.given.photos import find_tokens  # noqa: PLC0415
     from tangram_vision.given.picture_files import read_picture  # noqa: PLC0415
 
@@ -56,7 +56,7 @@ def read_photograph(target: str, task: Place, anywhere: bool = False) -> Photogr
 
 
 def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.Image:
-    """The photograph with the outlines of what was seen, and how much that was below."""
+    """The photograph with the outlines of the tokens found, and their number below."""
     picture = outlined(photograph.given.picture, layout, photograph.outlines, size)
     seen = f"{layout.tokens} tokens" if layout.tokens > 1 else layout.shapes[0].name
     return contact_sheet([picture], 1, [f"seen: {seen.replace('_', ' ')}"])

@@ -1,4 +1,4 @@
-"""Puzzles as what a run is to assemble: found, checked against its tokens, turned and played.
+"""Puzzles as targets of a run: read, checked against its tokens, turned and played.
 
 Legend: E episodes, K tokens.
 """
@@ -24,7 +24,7 @@ from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 from worker.play import rollout
 
-Player = Callable[[Env], Chooser]  # made for the environments in which it plays
+Player = Callable[[Env], Chooser]  # makes a policy for environments
 _ROUNDING = 1e-9
 
 
@@ -33,10 +33,10 @@ class Figure:
     """A puzzle at one angle, as the target of a run's tokens.
 
     Attributes:
-        name: of the puzzle.
-        degrees: by which it is turned from how it was drawn.
-        poses: (K, 3) of the tokens in it.
-        flipped: (K,) tokens that lie on their other side in it.
+        name: name of the puzzle.
+        degrees: turn relative to the drawing.
+        poses: (K, 3) poses of the tokens in the figure.
+        flipped: (K,) tokens that lie on their other side.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Figure:
 
     @property
     def title(self) -> str:
-        """The name for a picture, and by how much it is turned."""
+        """Name and turn, as the title of a picture."""
         name = self.name.replace("_", " ")
         return f"{name} {self.degrees:g}°" if self.degrees else name
 
@@ -60,37 +60,37 @@ def find_figures(
     """The puzzles of a file or of the library as targets of a run.
 
     Args:
-        source: a file, or a split of the library; None is all of the library.
-        task: whose tokens are to be moved.
-        names: of the puzzles wanted; None is all that there are.
-        turns: at so many angles each, evenly spread from the one that it is drawn at.
+        source: a file, or a split of the library; None: the whole library.
+        task: the task of the run.
+        names: names of the puzzles wanted; None: all of the source.
+        turns: number of angles of each puzzle, evenly spread from that of the drawing.
 
     Raises:
-        ConfigError: a file that cannot be used, an unknown name, or pieces that are not the tokens.
+        ConfigError: a file cannot be used, a name is unknown, or pieces differ from the tokens.
     """
     puzzles = _named(_read(source, task.tokens.scale), names, source)
     return tuple(figure for puzzle in puzzles for figure in _turns(puzzle, task, turns))
 
 
 def by(actor: Actor) -> Player:
-    """What an actor plays, exploration off."""
+    """A player that follows an actor, without exploration."""
     return lambda _: rollout.greedy(actor)
 
 
 def play_figures(
     task: Place, figures: Sequence[Figure], player: Player, seed: int, touching: bool = True
 ) -> Played:
-    """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
+    """Assemble E figures, one episode each; seed and figure decide where the tokens start.
 
     Args:
-        task: whose tokens are moved.
-        figures: E.
-        player: moves them.
-        seed: of the starts.
-        touching: whether their pieces touch, so that no picture tells them apart.
+        task: the task of the run.
+        figures: the E figures.
+        player: makes the policy that plays.
+        seed: seed of the starts.
+        touching: whether pieces touch, so that they cannot be told apart in pictures.
 
     Raises:
-        ConfigError: pictures are to be observed, and pieces touch; or silhouettes are.
+        ConfigError: agents observe pictures, and pieces touch.
         SamplingError: the tokens find no room to start.
     """
     looks = task.sim.observe == "pictures"
@@ -118,7 +118,7 @@ def play_figures(
 
 
 def _generator(figure: Figure, seed: int) -> np.random.Generator:
-    """A figure's own, whatever else is in its file."""
+    """The generator of a figure, the same whatever other figures are played."""
     return episode_generator(seed, f"puzzle {figure.name}", 0, 0, round(figure.degrees * 1000))
 
 

@@ -1,6 +1,6 @@
-"""A figure whose pieces are not told as what a run is to assemble: it is filled first.
+"""A figure with hidden pieces as a target: a search fills it before the run plays.
 
-What nothing fills is approached: the run lays the tokens as near to it as was found.
+If the search finds no exact filling, the run assembles the nearest figure found.
 
 Legend: H x W pixels of a picture, V corners.
 """
@@ -25,20 +25,20 @@ if TYPE_CHECKING:  # they need OpenCV and shapely
     from tangram_vision.solving import Answer
 
 RED = (220, 38, 38)
-_TILE = 480  # pixels of a picture that is alone
-_EDGE = 3  # pixels: what differs less widely is the roughness of edges
+_TILE = 480  # side of a single picture in pixels
+_EDGE = 3  # pixels: narrower differences are rough edges
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A silhouette and what fills it, or comes nearest.
+    """A silhouette, and tokens that fill it or come nearest.
 
     Attributes:
-        picture: of it, in colour.
-        outlines: (V, 2) corners of the tokens, pixels of the picture, y down.
-        figure: the tokens in the middle of a run's arena.
-        exact: whether they fill it.
-        told: how it was filled, in words.
+        picture: the silhouette in colour.
+        outlines: (V, 2) corners of the tokens in pixels of the picture, y down.
+        figure: the tokens, moved to the middle of the run's arena.
+        exact: whether the tokens fill the silhouette.
+        told: how the silhouette was filled, in words.
     """
 
     picture: Image.Image
@@ -49,18 +49,18 @@ class Shown:
 
 
 def answered(name: str, source: str, task: Place) -> "Answer":
-    """How a run's tokens make a figure.
+    """Search how a run's tokens fill a figure.
 
     Args:
-        name: of a file, or of a puzzle of the library.
-        source: what errors call it.
-        task: the run.
+        name: path of a file, or name of a puzzle of the library.
+        source: name of the figure in errors.
+        task: the task of the run.
 
     Raises:
-        ConfigError: it cannot be read, or OpenCV or shapely is not installed.
+        ConfigError: the figure cannot be read, or OpenCV or shapely is not installed.
     """
     try:
-        # Only here: other targets need neither.
+        # Imported here: other targets need neither OpenCV nor shapely.
         from tangram_vision import solving  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError(
@@ -71,10 +71,10 @@ def answered(name: str, source: str, task: Place) -> "Answer":
 
 
 def read_silhouette(name: str, source: str, task: Place) -> Shown:
-    """A silhouette, and a run's tokens in it; see `answered`.
+    """Read a silhouette and fill it with a run's tokens; see `answered`.
 
     Raises:
-        ConfigError: see there; or the tokens would reach out of the run's arena.
+        ConfigError: as in `answered`, or the tokens would reach out of the run's arena.
     """
     layout = task.layout
     answer = answered(name, source, task)
@@ -92,7 +92,7 @@ def read_silhouette(name: str, source: str, task: Place) -> Shown:
     return Shown(picture, outlines, figure, answer.exact, answer.told)
 
 
-# What is drawn
+# Drawing
 
 
 def draw_silhouette(silhouette: Shown, layout: Layout, bare: str = "") -> Image.Image:
@@ -101,11 +101,11 @@ def draw_silhouette(silhouette: Shown, layout: Layout, bare: str = "") -> Image.
     Args:
         silhouette: what was found.
         layout: the tokens.
-        bare: what it is called without any tokens, as an agent of outlines is shown it.
+        bare: title of a picture without tokens, as agents of outlines see it; empty: draw tokens.
     """
     shown = np.full(layout.tokens, not bare)
     picture = outlined(silhouette.picture, layout, silhouette.outlines, _TILE, shown)
-    told = silhouette.told if silhouette.exact else "the nearest figure; red: missing or over"
+    told = silhouette.told if silhouette.exact else "the nearest figure; red: missing or too much"
     return contact_sheet([picture], 1, [bare or told])
 
 

@@ -1,4 +1,4 @@
-"""What `target=` names: a puzzle, a drawing, a silhouette or a photograph, told apart by itself."""
+"""Finds out whether `target=` names a puzzle, a silhouette or a photograph."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # needs OpenCV and shapely
     from tangram_vision.solution import Solution
 
 PUZZLE, SILHOUETTE, PHOTOGRAPH = "puzzle", "silhouette", "photograph"
-MOST_PARTS = 3  # of a figure; a picture of more is a photograph
+MOST_PARTS = 3  # areas of a figure; a picture with more is a photograph
 TOLD = {
     PUZZLE: "a puzzle with its pieces",
     SILHOUETTE: "a figure without its pieces",
@@ -23,12 +23,12 @@ TOLD = {
 
 
 def told_apart(target: str, task: Place) -> str:
-    """Which of `TOLD` a target is, a file or the name of a puzzle of the library.
+    """The kind of a target, a key of `TOLD`; the target is a file or a puzzle's name.
 
-    A picture is a photograph if it shows all tokens of the run, three touching at most.
+    A picture is a photograph if it shows all tokens of the run, at most three of them touching.
 
     Raises:
-        ConfigError: there is no such file, or it is a photograph that lacks tokens.
+        ConfigError: the file is missing, or it is a photograph that lacks tokens.
     """
     path, source = Path(target), f"target={target}"
     if not path.suffix and not path.is_file():
@@ -44,7 +44,7 @@ def told_apart(target: str, task: Place) -> str:
     try:
         from tangram_vision.given.photos import LackingError  # noqa: PLC0415
     except ImportError:
-        return SILHOUETTE  # whose reader says what is missing
+        return SILHOUETTE  # its reader says which package is missing
     try:
         read_photograph(target, task, anywhere=True)
     except LackingError as error:
@@ -57,16 +57,16 @@ def told_apart(target: str, task: Place) -> str:
 
 
 def solved(target: str, source: str, task: Place, kind: str) -> "Solution":
-    """Where a run's tokens lie in a target.
+    """Find where a run's tokens lie in a target.
 
     Args:
-        target: a file, or the name of a puzzle of the library, whose pieces are forgotten.
-        source: what errors call it.
-        task: the run.
-        kind: which of `TOLD` it is.
+        target: a file, or the name of a puzzle, whose own pieces are ignored.
+        source: name of the target in errors.
+        task: the task of the run.
+        kind: kind of the target, a key of `TOLD`.
 
     Raises:
-        ConfigError: it cannot be read, or OpenCV or shapely is not installed.
+        ConfigError: the target cannot be read, or OpenCV or shapely is not installed.
     """
     layout, scale = task.layout, task.tokens.scale
     if kind != PHOTOGRAPH:

@@ -1,1 +1,1 @@
-"""Films of episodes, and what an agent was shown. Imports no other folder of tangram_game."""
+"""Films of episodes, and pictures that an agent saw. Imports no other folder of tangram_game."""

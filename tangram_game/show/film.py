@@ -19,21 +19,21 @@ from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 
 FRAMES_PER_ACTION = 20
-MAX_FRAMES = 100  # of motion; more actions get fewer each
+MAX_FRAMES = 100  # of motion; with more actions, each gets fewer
 WIDTH = 960  # pixels across a film, about
 
 
 @dataclass(frozen=True, eq=False)
 class Show:
-    """Episodes that were played to be looked at.
+    """Played episodes, and their titles in a picture or a film.
 
     Attributes:
         task: the task as it was played.
         played: E episodes.
-        titles: what each is called.
-        kind: what one is called.
-        seen: a picture of where the target comes from, if from one.
-        note: what else is to be told.
+        titles: title of each episode.
+        kind: noun for one episode, such as puzzle.
+        seen: picture from which the target comes, if any.
+        note: further remark for the printed line.
     """
 
     task: Place
@@ -44,7 +44,7 @@ class Show:
     note: str = ""
 
     def told(self) -> str:
-        """What was shown and how well it went, in words."""
+        """Number of episodes, mean score and note, as one line of text."""
         mean = float(self.played.overlap.mean())
         score = "raw overlap" if self.kind == "episode" else "coverage"
         note = f"; {self.note}" if self.note else ""
@@ -52,22 +52,21 @@ class Show:
 
 
 def frames_per_action(horizon: int) -> int:
-    """Fewer in long episodes: all frames of a film are in memory at a time."""
+    """Frames of an action; fewer in long episodes, as memory holds all frames of a film."""
     return max(min(FRAMES_PER_ACTION, MAX_FRAMES // horizon), 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """How E scenes look at one moment.
+    """State of E scenes at one moment.
 
     Attributes:
-        poses: (E, K, 3) of the tokens.
-        rolls: (E, K) radians by which they are turned over about their body's x axis: pi on their
-            other side.
-        held: (E,) the token that is moved, -1 if none is.
-        height: 0 on the table to 1 as high as tokens are carried.
-        stopped: (E,) the token cannot be set down where it is going.
-        done: actions that are over.
+        poses: (E, K, 3) poses of the tokens.
+        rolls: (E, K) angles in radians about the x axis of the token's body: pi on the other side.
+        held: (E,) number of the token that is moved, -1 if none is.
+        height: height of that token, from 0 (on the table) to 1 (carried).
+        stopped: (E,) whether that token cannot be set down at its goal.
+        done: number of actions that are over.
     """
 
     poses: Floats
@@ -78,7 +77,7 @@ class Frame:
     done: int
 
     def corners(self, layout: Layout) -> Floats:
-        """(E, V, 2) as they are seen from above: a token that is turned over gets narrow."""
+        """Corners (E, V, 2) seen from above; a token gets narrow while it is turned over."""
         pose = self.poses[..., layout.token_of_corner, :]
         cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
         x, y = layout.body.T
@@ -93,7 +92,7 @@ class Frame:
 
 
 def film(task: Place, played: Played) -> list[Frame]:
-    """The start, equally many frames for each action, and the end."""
+    """Frames of a film: the start, equally many for each action, and the end."""
     count = frames_per_action(played.episodes.actions.shape[1])
     moves = [_Move(task, played, t) for t in range(played.episodes.actions.shape[1])]
     frames = [move.at((i + 1) / count) for move in moves for i in range(count)]
@@ -129,8 +128,8 @@ class _Move:
 
     def at(self, share: float) -> Frame:
         """The frame after a share of the action's time in (0, 1]."""
-        way = share * share * (3.0 - 2.0 * share)  # gently off and on
-        # What is carried leaves the others alone until it is set down.
+        way = share * share * (3.0 - 2.0 * share)  # slow at start and end
+        # Other tokens do not move until the carried one is set down.
         gone: Floats = np.full(self._poses.shape[:2], float(share == 1.0))
         there_and_back = 1.0 - abs(2.0 * way - 1.0)
         gone[self._rows, self._token] = np.where(self._stopped, there_and_back, way)
@@ -145,7 +144,7 @@ class _Move:
 
 
 def film_pictures(show: Show) -> list[Image.Image]:
-    """All episodes side by side, token after token."""
+    """Pictures of a film: all episodes side by side, token after token."""
     layout, played = show.task.layout, show.played
     below = [
         captions(layout, played.corners[:, t], played.goals, show.titles)

@@ -1,4 +1,4 @@
-"""What an agent was shown, drawn for people: pictures with what was found in them over them.
+"""Pictures that an agent saw, with the outlines of the tokens found in them.
 
 Legend: E episodes, T steps, K tokens, V corners, P pixels along a side.
 """
@@ -20,14 +20,14 @@ from tangram_tasks.played import Played
 def outlined(
     picture: Image.Image, layout: Layout, outlines: Floats, size: int, found: Bools | None = None
 ) -> Image.Image:
-    """A picture in a square, and the outlines of tokens over it.
+    """A picture fitted into a square, with the outlines of tokens over it.
 
     Args:
         picture: of any size.
         layout: the tokens.
-        outlines: (V, 2) their corners, pixels of the picture, y down.
-        size: of the square, in pixels.
-        found: (K,) which are drawn; None is all.
+        outlines: (V, 2) corners of the tokens in pixels of the picture, y down.
+        size: side of the square in pixels.
+        found: (K,) tokens to draw; None: all.
     """
     share = size * SAMPLES / max(picture.size)
     width, height = (round(side * share) for side in picture.size)
@@ -46,13 +46,13 @@ def outlined(
 
 
 def camera_sheets(task: Place, played: Played, columns: int, size: int) -> list[Image.Image]:
-    """For each of T + 1 moments the pictures of all episodes; none where no pictures were observed.
+    """Sheets of all episodes' pictures, one for each of T + 1 moments; empty if none were seen.
 
     Args:
         task: the task as it was played.
         played: the episodes.
         columns: pictures in a row.
-        size: side of one in pixels.
+        size: side of a picture in pixels.
     """
     pictures = played.pictures
     if pictures is None:
@@ -75,9 +75,9 @@ def camera_sheets(task: Place, played: Played, columns: int, size: int) -> list[
 
 
 def beside(frames: Sequence[Image.Image], sheets: Sequence[Image.Image]) -> list[Image.Image]:
-    """For each frame of a film the sheet of its moment.
+    """The sheet of the moment of each frame of a film.
 
-    A film has its start, equally many frames for each action and perhaps its end, see
+    A film has one frame of the start, equally many of each action, and perhaps one of the end, see
     `tangram_game.show.film.film`.
     """
     actions = len(sheets) - 1
@@ -86,6 +86,6 @@ def beside(frames: Sequence[Image.Image], sheets: Sequence[Image.Image]) -> list
 
 
 def _told(found: Bools) -> str:
-    """What a camera's picture is called."""
+    """The caption of a camera's picture."""
     count = int(np.count_nonzero(found))
     return "seen by the camera" if found.all() else f"{plural(count, 'token')} of {len(found)} seen"

@@ -1,5 +1,5 @@
-"""Measurements and long trials: tangram-bench. `README.md` beside this lists them.
+"""Speed measurements and long trials: tangram-bench. `README.md` in this folder lists them.
 
-Start with `stages.py`. Folders: speed (rates, against what else one could do), trials (faults and
-attacks). `measure.py`, `trainings.py` and `setups.py` are of both.
+Start with `stages.py`. Folders: speed (rates compared with alternatives), trials (faults and
+attacks). Both use `measure.py`, `trainings.py` and `setups.py`.
 """

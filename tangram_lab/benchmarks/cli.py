@@ -1,4 +1,4 @@
-"""`tangram-bench`: how fast it is against what else one could do, and trials with faults."""
+"""`tangram-bench`: speed compared with alternatives, and trials with faults and attacks."""
 
 import argparse
 import re
@@ -12,26 +12,26 @@ from tangram_core.settings import check_range
 from tangram_core.store.files import check_writable
 
 EPILOG = """\
-Options may be written as elsewhere in this project: runs=9 for --runs 9.
+Options may be written like settings: runs=9 for --runs 9.
 
 examples:
   tangram-bench learner                     a table of the learner alone
-  tangram-bench learner runs=9 out=l.json   more runs, and a file with machine, versions, commit
+  tangram-bench learner runs=9 out=l.json   nine runs, and a file with machine, versions, commit
   tangram-bench all out=bench.json          learner and scaling (make bench)
   tangram-bench fetch id=PandaPush-v3 minutes=60    ours and Stable-Baselines3 side by side
-  tangram-bench fetch seeds=3 rows=fetch.csv    five tasks; given again, it goes on
-  tangram-bench chaos minutes=20 seed=1     random faults over a real training
-  tangram-bench attack out=attack.json      every attack that is known, on real trainings
+  tangram-bench fetch seeds=3 rows=fetch.csv    five tasks; the same command again continues
+  tangram-bench chaos minutes=20 seed=1     random faults in a real training
+  tangram-bench attack out=attack.json      all known attacks on real trainings
 """
 RATES = {
-    "learner": "updates against single operations and Stable-Baselines3",
-    "fetch": "tasks of Fetch and Panda learned, against Stable-Baselines3",
-    "scaling": "more workers, and 64 synthetic ones",
-    "gpu": "updates on a GPU, recorded, against other ways there and one core",
+    "learner": "compiled updates, compared with single operations and Stable-Baselines3",
+    "fetch": "learning of Fetch and Panda tasks, compared with Stable-Baselines3",
+    "scaling": "one and two workers, and up to 1,000 synthetic ones",
+    "gpu": "recorded updates on a GPU, compared with other ways on the GPU and with one core",
 }
 TRIALS = {
-    "chaos": "random faults over a real training",
-    "attack": "every attack that is known, on trainings that run; what held",
+    "chaos": "random faults in a real training: what recovers and what is lost",
+    "attack": "all known attacks on real trainings: which ones fail to do harm",
 }
 # Option -> its bounds.
 BOUNDS = {
@@ -56,24 +56,24 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--runs", type=int, default=5, help="measurements of each rate (5)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
         if name == "fetch":
-            one.add_argument("--id", help="of gymnasium (five of Fetch and Panda)")
-            one.add_argument("--minutes", type=float, default=60.0, help="of each training (60)")
-            one.add_argument("--seeds", type=int, default=1, help="of each, from 0 (1)")
+            one.add_argument("--id", help="gymnasium id of one task (five of Fetch and Panda)")
+            one.add_argument("--minutes", type=float, default=60.0, help="per training (60)")
+            one.add_argument("--seeds", type=int, default=1, help="seeds per task, from 0 (1)")
             one.add_argument("--agent", default="goal", help="our preset: goal or push (goal)")
-            one.add_argument("--workers", type=int, default=0, help="of ours (0: one for a core)")
-            one.add_argument("--rows", type=Path, help="CSV file: what it has is not run again")
+            one.add_argument("--workers", type=int, default=0, help="our workers (0: by cores)")
+            one.add_argument("--rows", type=Path, help="CSV file: trainings in it are not repeated")
     for name, text in TRIALS.items():
         one = kinds.add_parser(name, help=text, description=text)
         if name == "chaos":
-            one.add_argument("--minutes", type=float, default=20.0, help="of faults (20)")
-            one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+            one.add_argument("--minutes", type=float, default=20.0, help="time with faults (20)")
+            one.add_argument("--seed", type=int, default=0, help="seed of faults and training (0)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
     return parser
 
 
 def main() -> int:
-    """The command."""
-    # As after Ctrl-C, so that no process that was started is left.
+    """Run tangram-bench and return its exit status."""
+    # SIGTERM then ends the program as Ctrl-C does, with all processes that it started.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     arguments = _parser().parse_args([_dashed(argument) for argument in sys.argv[1:]])
     try:
@@ -98,7 +98,7 @@ def _dashed(argument: str) -> str:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    # Late imports: --help and wrong input are answered at once.
+    # Imported late, so that --help and wrong input answer at once.
     if arguments.kind not in TRIALS:
         from tangram_lab.benchmarks.stages import run_stages
 

@@ -1,4 +1,4 @@
-"""Rates of two ways to do the same, measured in turns, and their ratio with its spread."""
+"""Speed of two implementations, measured in turns, and their ratio with its spread."""
 
 import json
 import os
@@ -17,25 +17,25 @@ from rich.table import Table
 from master.watch.result import commit, processor, versions
 
 SPAN_S = 0.5
-# Does some of the work; returns how much of the unit that was.
+# Does one portion of work and returns its amount, in the unit of the rate.
 Work = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison, or one number beside its bound.
+    """One comparison, or one number without a rival.
 
     Attributes:
-        stage: the benchmark.
+        stage: name of the benchmark.
         case: what was measured.
-        unit: of `ours` and `theirs`.
-        ours: median over the runs.
-        against: what it is compared with.
-        theirs: its median; None where there is none.
-        ratio: median over the runs of ours / theirs of one run.
-        least, most: of that ratio.
-        target: what the ratio (or, where there is none, `ours`) is to be; empty for none.
-        held: whether it is; None where there is no target.
+        unit: unit of `ours` and `theirs`.
+        ours: our median over the runs.
+        against: name of the rival; empty without one.
+        theirs: median of the rival; None without one.
+        ratio: median over the runs of ours / theirs; None without a rival.
+        least, most: smallest and largest ratio, or without a rival smallest and largest number.
+        target: required bound of the ratio, or without a rival of `ours`; empty for none.
+        held: whether the target is met; None without a target.
     """
 
     stage: str
@@ -51,19 +51,19 @@ class Row:
     held: bool | None = None
 
     def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """The fields as a dict for JSON."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Bound:
-    """What a number is to be: at least `least`, or at most `most`."""
+    """Required bounds of a number: at least `least`, at most `most`."""
 
     least: float | None = None
     most: float | None = None
 
     def holds(self, value: float) -> bool:
-        """Whether a value lies within."""
+        """Whether a value is within the bounds."""
         low = self.least is None or value >= self.least
         return low and (self.most is None or value <= self.most)
 
@@ -73,7 +73,7 @@ class Bound:
 
 
 def rate(work: Work, span_s: float) -> float:
-    """Units in a second, over at least `span_s`."""
+    """Units of work per second, measured over at least `span_s` seconds."""
     begin, count = time.perf_counter(), 0.0
     while (passed := time.perf_counter() - begin) < span_s:
         count += work()
@@ -81,9 +81,9 @@ def rate(work: Work, span_s: float) -> float:
 
 
 def rates(works: Mapping[str, Work], runs: int, span_s: float = SPAN_S) -> dict[str, list[float]]:
-    """Rates of all, `runs` times, in turns: what else the machine does meets them all."""
+    """Measure every rate `runs` times, in turns, so other load on the machine affects all alike."""
     for work in works.values():
-        work()  # whatever is only done once
+        work()  # warm up: compilation and other work that is done only once
     found: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(runs):
         for name, work in works.items():
@@ -98,14 +98,14 @@ def compare(
     runs: int,
     bound: Bound | None = None,
 ) -> Row:
-    """Measure both in turns.
+    """Measure two implementations in turns.
 
     Args:
         labels: stage, case and unit.
-        ours: our way.
-        theirs: name and way of what it is compared with.
-        runs: of both.
-        bound: of the ratio.
+        ours: our implementation.
+        theirs: name and implementation of the rival.
+        runs: number of measurements of each.
+        bound: required bound of the ratio.
     """
     found = rates({"ours": ours, "theirs": theirs[1]}, runs)
     return compared(labels, found["ours"], theirs[0], found["theirs"], bound)
@@ -118,7 +118,7 @@ def compared(
     theirs: Sequence[float],
     bound: Bound | None = None,
 ) -> Row:
-    """The row of numbers that were measured in turns."""
+    """Make and print the row of two series of numbers that were measured in turns."""
     ratios = [mine / other for mine, other in zip(ours, theirs, strict=True)]
     middle = statistics.median(ratios)
     return told(
@@ -139,7 +139,7 @@ def compared(
 def single(
     labels: tuple[str, str, str], values: Sequence[float], bound: Bound | None = None
 ) -> Row:
-    """The row of a number that stands for itself; `least` and `most` are its own."""
+    """Make and print the row of one series of numbers without a rival."""
     middle = statistics.median(values)
     return told(
         Row(
@@ -154,7 +154,7 @@ def single(
 
 
 def told(row: Row) -> Row:
-    """Print a row at once, since the whole takes long."""
+    """Print a row at once, because the whole benchmark takes long; return the row."""
     ratio = "" if row.ratio is None else f", {row.ratio:.3g} times {row.against}"
     Console(stderr=True).print(
         f"{row.stage}: {row.case}: {row.ours:,.4g} {row.unit}{ratio}", highlight=False
@@ -162,7 +162,7 @@ def told(row: Row) -> Row:
     return row
 
 
-# Tables on the terminal, and JSON files that say where their numbers come from
+# Tables on the terminal, and JSON files with the origin of their numbers
 
 
 def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -172,19 +172,19 @@ def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
     for row in rows:
         table.add_row(*(_text(value) for value in row.values()))
-    # Wide enough for all columns also where the output goes into a file.
+    # Output that is no terminal gets a fixed width that fits all columns.
     Console(width=None if sys.stdout.isatty() else 220).print(table)
 
 
 def page(title: str, rows: Sequence[Mapping[str, Any]]) -> str:
-    """The same table in Markdown."""
+    """A Markdown page with a table of rows with equal keys."""
     lines = [f"# {title}", "", "| " + " | ".join(rows[0]) + " |", "|---" * len(rows[0]) + "|"]
     lines += ["| " + " | ".join(_text(value) for value in row.values()) + " |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
 def write(path: Path | None, content: Mapping[str, Any]) -> None:
-    """Write results with the command, the commit, the machine and the versions; None: nothing."""
+    """Write results as JSON with command, commit, machine and versions; nothing if path is None."""
     if path is None:
         return
     source = {

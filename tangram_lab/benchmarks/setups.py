@@ -1,4 +1,4 @@
-"""Setups of the presets, as the measurements use them."""
+"""Setups, episodes and transitions for the measurements."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -20,46 +20,46 @@ from worker.play.rollout import Rollout
 
 
 def preset(agent: str = "tangram") -> Setup:
-    """What tangram-train makes of an agent's preset: one square, moved by PyBullet."""
+    """The setup of tangram-train with the preset of an agent: one square, moved by PyBullet."""
     return make_setup(composed("train", ["run_dir=x", f"agent={agent}"]))
 
 
 def robot(id: str, module: str, *told: str) -> Setup:  # noqa: A002 - as gymnasium calls it
-    """A goal environment that a module registers, and what is told of its agent."""
+    """The setup of a goal environment that a module registers; `told` are more settings."""
     task = ["task=gym", f"task.id={id}", f"task.imports=[{module}]"]
     return make_setup(composed("train", ["run_dir=x", *task, *told]))
 
 
 def goal_config(setup: Setup) -> GoalConfig:
-    """What the goal agent of a setup is told."""
+    """The configuration of the goal agent in a setup."""
     return cast("Goal", setup.agent).config
 
 
 def place(setup: Setup) -> Place:
-    """The task of such a setup."""
+    """The task of a setup whose task is Place."""
     return cast("Place", setup.task)
 
 
 def several(count: int) -> Setup:
-    """The first tans of the game, each moved once, in the game's arena."""
+    """The setup of a task with the first `count` tans, in the arena of the game."""
     setup = preset()
     return replace(setup, task=replace(place(setup), tokens=TokensConfig(SEVEN[:count], 0.6)))
 
 
 def with_agent(setup: Setup, **values: Any) -> Setup:
-    """Another agent."""
+    """The same setup, with other values in the configuration of its agent."""
     agent: Any = setup.agent
     return replace(setup, agent=replace(agent, config=replace(agent.config, **values)))
 
 
-# Episodes and transitions of them
+# Episodes and transitions
 
 
 ENVS = 32
 
 
 def played(setup: Setup, count: int) -> Episodes:
-    """Episodes of random actions, tokens without an engine; `count` is a multiple of ENVS."""
+    """Play `count` episodes (a multiple of ENVS) of random actions, without a physics engine."""
 
     def choose(_seen: Arrays, _past: History, generators: Generators) -> Singles:
         size = setup.spec.action_size
@@ -73,7 +73,7 @@ def played(setup: Setup, count: int) -> Episodes:
 
 
 def random_transitions(setup: Setup, count: int) -> Transitions:
-    """Transitions of the right shapes; nothing moves as it would."""
+    """Random transitions with the right shapes; they do not obey the simulation."""
     rng, layout = np.random.default_rng(0), place(setup).layout
     corners, tokens = layout.corner_count, layout.tokens
     state, after, goal = rng.uniform(-1, 1, (3, count, corners, 2)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Which stages there are, and what a run of them prints and writes."""
+"""The benchmarks by name (stages), and the tables and files that they write."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -20,11 +20,11 @@ STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
 
 
 def run_stages(given: argparse.Namespace) -> int:
-    """Measure one stage or all; the exit status is 0 whatever was found.
+    """Measure one stage or all; return exit status 0, even if a target was missed.
 
-    With `out` the table goes into a Markdown file beside the JSON.
+    With `out`, write the results as JSON and the table as Markdown beside it.
     """
-    torch.set_num_threads(1)  # both as masters and workers do
+    torch.set_num_threads(1)  # this and the next line: as in masters and workers
     keep_memory()
     names = ["learner", "scaling"] if given.kind == "all" else [given.kind]
     rows = [row for name in names for row in STAGES[name](given)]
@@ -32,7 +32,7 @@ def run_stages(given: argparse.Namespace) -> int:
     show(title, cells)
     missed = [f"{row.stage}: {row.case}" for row in rows if row.held is False]
     if missed:
-        print("short of the target:", *missed, sep="\n  ")
+        print("missed the target:", *missed, sep="\n  ")
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.with_suffix(".md").write_text(page(title, cells))
@@ -44,13 +44,14 @@ def run_stages(given: argparse.Namespace) -> int:
 
 
 def _matches(given: argparse.Namespace) -> list[Match]:
-    """Every task once, then again with the next seed."""
+    """All tasks with the first seed, then all tasks with the next seed."""
     tasks = TASKS if given.id is None else (given.id,)
     rest = (given.minutes, given.agent, given.workers)
     return [Match(task, seed, *rest) for seed in range(given.seeds) for task in tasks]
 
 
 def cells_of(row: Row) -> dict[str, object]:
+    """Column -> content of the row in the table."""
     spread = "" if row.least is None else f"{row.least:,.3g} - {row.most:,.3g}"
     held = {None: "", True: "yes", False: "NO"}[row.held]
     return {

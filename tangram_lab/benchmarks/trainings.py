@@ -1,4 +1,4 @@
-"""Trainings in the background, as the trials start and watch them."""
+"""Start and watch trainings in the background, for trials and measurements."""
 
 import json
 import os
@@ -23,18 +23,18 @@ MIB = 2**20
 
 
 def command(name: str) -> list[str]:
-    """Run tangram-NAME of this installation, whatever lies in the current folder."""
+    """The command line of tangram-NAME of this installation, for any current folder."""
     return [sys.executable, "-P", "-m", "tangram_cli", name]
 
 
 def start_training(folder: Path, *settings: str, name: str = "train") -> "subprocess.Popen[bytes]":
-    """A training in the background, or a `master`; what it says goes to `told` in its folder.
+    """Start tangram-NAME in the background; its output goes to the file `told` in the run folder.
 
-    A training ends when this process is gone: its lifeline is never cut here.
+    A training ends when this process ends, because the training holds a lifeline to this process.
     """
     folder.mkdir(parents=True)
     lifeline, variables = Lifeline(), dict(os.environ)
-    if name == "train":  # a master with a lifeline takes its parent for a launcher
+    if name == "train":  # a master with a lifeline would expect a launcher as its parent
         variables = lifeline.environment(variables)
     with (folder / "told").open("wb") as told:
         process = subprocess.Popen(
@@ -50,13 +50,13 @@ def start_training(folder: Path, *settings: str, name: str = "train") -> "subpro
 
 
 def free_port() -> int:
-    """One that nobody listens on, and whose next one is free most often."""
+    """A TCP port that is free; the next port is usually free, too."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return int(probe.getsockname()[1])
 
 
 def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
-    """Wait for a file of a training that runs; TangramError if that ends before."""
+    """Wait until a training has written a file; TangramError if the training ends before."""
     while not path.exists():
         if process.poll() is not None:
             raise TangramError(f"the training ended before {path} was there")
@@ -64,17 +64,17 @@ def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
 
 
 def processes_of(folder: Path) -> dict[psutil.Process, str]:
-    """Process -> command line, of those that name a run folder."""
+    """Process -> command line, for all processes whose command line contains the run folder."""
     found, quoted = {}, override("in", str(folder)).removeprefix("in='").removesuffix("'")
     for process in psutil.process_iter(["cmdline"]):
-        line = " ".join(process.info["cmdline"] or ())  # none of a process that ended meanwhile
+        line = " ".join(process.info["cmdline"] or ())  # None if the process has just ended
         if (str(folder) in line or quoted in line) and process.pid != os.getpid():
             found[process] = line
     return found
 
 
 def numbers_of(folder: Path, patience_s: float = PATIENCE_S) -> dict[str, float]:
-    """Those of a run's status; TangramError where its master does not answer in time."""
+    """Name -> number in the status of a run; TangramError if the master does not answer in time."""
     with zmq.Context() as context:
         return dict(ask_status(str(folder), context, patience_s).numbers)
 

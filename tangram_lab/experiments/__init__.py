@@ -1,5 +1,4 @@
-"""Studies: which agents are trained and tested, running what is missing, tables and figures.
+"""Studies: train and test the agents of a study, then write tables and figures.
 
-Start with `studies.py`, which reads conf/studies.yaml. May import master and worker, tangram_game
-too.
+Start with `studies.py`, which reads conf/studies.yaml. May import master, worker and tangram_game.
 """

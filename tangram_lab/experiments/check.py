@@ -1,8 +1,8 @@
-"""Whether every score on a page stands in the CSV files that its section links.
+"""Check that every score on a page is in the CSV or JSON files that its section links.
 
-A score is a number of three decimals and more, or a percentage with one. A section is what stands
-under a heading; where it links no file of results, those of the page's beginning count, or else all
-that the page links. What stands in code is no score.
+A score is a number with three or more decimals, or a percentage with at least one. A section is
+the text under one heading. A section that links no file of results is checked against all files
+that the page links. Numbers in code are no scores.
 """
 
 import json
@@ -26,18 +26,18 @@ RANGE = re.compile(rf"({NUMBER})\s+to\s+({NUMBER})")
 LINK = re.compile(r"\]\((?P<file>[^)#\s]+\.(?:csv|md|json))(?:#[^)]*)?\)")
 CODE = re.compile(r"^```.*?^```[ \t]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ .*$", re.MULTILINE)
-EVERYWHERE = "published.csv"  # what others report, the paper above all
+EVERYWHERE = "published.csv"  # scores that the paper and others report, valid in every section
 SCORED = (*("mean_reward", "mean_reward_dense", "coverage", "solved", "filled"),)
-SLACK = 0.500001  # of the last digit: as it is, or halfway between two
+SLACK = 0.500001  # tolerance of rounding, in units of the last digit shown
 
 
 class Known(NamedTuple):
-    """The numbers of some files.
+    """The numbers of some files, by the way a page may show them.
 
     Attributes:
-        single: (N,) that may stand alone.
-        spreads: (M, 3) median, least and most that may stand together.
-        cells: (K,) of files without runs, where any three may stand together.
+        single: (N,) numbers that may be shown alone.
+        spreads: (M, 3) median, least and most, which may be shown together.
+        cells: (K,) numbers of files that hold no runs; any three may be shown together.
     """
 
     single: Floats
@@ -46,20 +46,20 @@ class Known(NamedTuple):
 
 
 def check(results: Path, pages: Iterable[Path]) -> list[str]:
-    """What is wrong: scores of pages that stand in none of the files that they link.
+    """Error texts for all scores on the pages that are in none of the linked files.
 
     Args:
         results: folder of the CSV files.
-        pages: that show scores.
+        pages: Markdown files.
 
     Raises:
-        RunError: a file cannot be read.
+        RunError: a file of results cannot be read.
     """
     return [f"{page.name}: {wrong}" for page in pages for wrong in check_page(results, page)]
 
 
 def check_page(results: Path, page: Path) -> Iterator[str]:
-    """The scores of one page that have no source."""
+    """Error texts for the scores of one page that are in none of the linked files."""
     text = page.read_text(encoding="utf-8")
     starts = [0, *(found.start() for found in HEADING.finditer(text)), len(text)]
     sections = [text[one:other] for one, other in pairwise(starts)]
@@ -70,7 +70,7 @@ def check_page(results: Path, page: Path) -> Iterator[str]:
             continue
         files = list(dict.fromkeys(_linked(results, page, section))) or every
         if not files:
-            yield f"{section.splitlines()[0]}: it has scores and links no file of results"
+            yield f"{section.splitlines()[0]}: it has scores but links no file of results"
             continue
         known = _together((*files, results / EVERYWHERE))
         for score in scores:
@@ -80,7 +80,7 @@ def check_page(results: Path, page: Path) -> Iterator[str]:
 
 
 def _scores(section: str) -> Iterator[tuple[str, ...]]:
-    """Every spread as three numbers, every range as two, every other score as one."""
+    """Scores of a section: a spread as three numbers, a range as two, any other score as one."""
     bare = CODE.sub("", section)
     for pattern in (SPREAD, RANGE, SCORE):
         for found in pattern.finditer(bare):
@@ -93,7 +93,7 @@ def _told(score: tuple[str, ...]) -> str:
 
 
 def _linked(results: Path, page: Path, text: str) -> Iterator[Path]:
-    """The files of numbers that a text links; a page of tables stands for its CSV."""
+    """CSV and JSON files that a text links; a link to a page of tables counts as its CSV."""
     for found in LINK.finditer(text):
         path = (page.parent / found["file"]).resolve()
         if path.suffix == ".md" and path.parent == results.resolve():
@@ -109,10 +109,10 @@ def _together(files: tuple[Path, ...]) -> Known:
 
 @cache
 def read_known(path: Path) -> Known:
-    """The numbers of one file.
+    """The numbers of one CSV or JSON file.
 
     Raises:
-        RunError: it cannot be read.
+        RunError: the file cannot be read.
     """
     none, empty = np.zeros((0, 3)), np.zeros(0)
     if path.suffix == ".json":
@@ -141,9 +141,9 @@ def _numbers(content: Any) -> Iterator[float]:
 
 
 def _stands(score: tuple[str, ...], known: Known) -> bool:
-    """Whether a number, a least and a most, or a median with both, are among those that are known.
+    """Whether one number, a range (2) or a median with its range (3) is among the known numbers.
 
-    A least and a most may be of two trainings.
+    The two ends of a range may come from different trainings.
     """
     if len(score) == 1:
         return bool(_near(known.single, score[0]).any())
@@ -156,7 +156,7 @@ def _stands(score: tuple[str, ...], known: Known) -> bool:
 
 
 def _near(numbers: Floats, text: str) -> np.ndarray[Any, Any]:
-    """(N,) whether a number is written so."""
+    """(N,) whether each number, rounded like `text`, is the number in `text`."""
     value = text.replace("\N{MINUS SIGN}", "-").rstrip("% ")
     slack = SLACK * 10.0 ** -len(value.partition(".")[2])
     shown = numbers * (100.0 if text.endswith("%") else 1.0)

@@ -1,6 +1,6 @@
 """The commands tangram-experiment and tangram-report.
 
-Everything heavy is imported after the config was composed, so --help and wrong input are instant.
+Heavy modules are imported after the settings are read, so --help and wrong input answer at once.
 """
 
 import sys
@@ -15,11 +15,11 @@ from tangram_core.settings import Settings, setting
 
 ROOT = Path(__file__).parents[2]
 RESULTS = "docs/results"
-GENERATED = ("settings.md",)  # pages that are written from declarations
+GENERATED = ("settings.md",)  # pages written by a program, which show no scores
 
 
 def experiment() -> int:
-    """tangram-experiment: trains and tests what a study lacks."""
+    """Run tangram-experiment, which does the missing runs of a study; return its exit status."""
     return entry("experiments", _experiment)
 
 
@@ -42,7 +42,7 @@ def _experiment(settings: Plain) -> int:
 
 
 def _check(name: str, told: Sequence[str]) -> None:
-    """Raise ConfigError where this code refuses a training, before any of them starts."""
+    """Raise ConfigError if the settings of a training are invalid, before any training starts."""
     from tangram_core.setup import make_setup
 
     try:
@@ -53,7 +53,7 @@ def _check(name: str, told: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class ReportConfig(Settings):
-    """Rows of studies and where to report on them; files of the same names are replaced."""
+    """Settings of tangram-report; existing tables and figures of the same names are replaced."""
 
     runs: str | None = setting(
         None,
@@ -62,7 +62,7 @@ class ReportConfig(Settings):
     )
     out: str | None = setting(None, "folder for tables and figures; null is runs")
     check: bool = setting(
-        False, "in a clone: whether every score of README and docs is in the CSV files it links"
+        False, "in a clone: check that every score in README and docs is in a CSV file it links"
     )
 
     def __post_init__(self) -> None:
@@ -75,7 +75,7 @@ class ReportConfig(Settings):
 
 
 def report() -> int:
-    """tangram-report: tables and figures of studies."""
+    """Run tangram-report, which writes tables and figures of studies; return its exit status."""
     if sys.argv[1:2] == ["check"]:
         sys.argv[1] = "check=true"
     return entry("report", _report)
@@ -100,15 +100,15 @@ def _check_pages() -> int:
     from tangram_lab.experiments.check import check
 
     if not (ROOT / RESULTS).is_dir():
-        raise ConfigError(f"check looks at {RESULTS} of a clone, which {ROOT} lacks: run it in one")
+        raise ConfigError(f"check needs {RESULTS}, which {ROOT} lacks: run it in a git clone")
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     wrong = check(ROOT / RESULTS, [page for page in pages if page.name not in GENERATED])
-    print("\n".join(wrong) or "every score of README and docs is in the files that it links")
+    print("\n".join(wrong) or "every score in README and docs is in a file that its section links")
     return 1 if wrong else 0
 
 
 def _with_absolute(settings: Plain, *names: str) -> Plain:
-    """Folders as seen from where the command was started; what is no text is left alone."""
+    """Make folders absolute, from the current folder; leave values that are not texts alone."""
     texts = {name: settings.get(name) for name in names}
     found = {n: text for n, text in texts.items() if isinstance(text, str) and text.strip()}
     return settings | {n: str(Path(text).expanduser().absolute()) for n, text in found.items()}

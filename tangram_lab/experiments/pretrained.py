@@ -1,7 +1,7 @@
-"""Making the agents that come with the package, from finished runs of several seeds.
+"""Make an agent that comes with the package, from finished runs of several seeds.
 
-`python -m tangram_lab.experiments.pretrained square runs/seeds/square/seed_*` puts the seed with
-the median score into `tangram_agent/pretrained/square`, with a card that tells the scores of all
+`python -m tangram_lab.experiments.pretrained square runs/seeds/square/seed_*` puts the run with
+the median score into `tangram_agent/pretrained/square`, with a card that has the scores of all
 seeds.
 """
 
@@ -33,16 +33,16 @@ from tangram_tasks.place import Place
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
 RESULT = "result.json"
-MAX_BYTES = 1_000_000  # of the weights: they travel with every installation
+MAX_BYTES = 1_000_000  # size limit of the weights, because every installation contains them
 FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of each figure
-TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
-# What an agent looks ahead by as it ships, and does not in training.
+TESTS, TEST_SEED = 400, 1  # fresh tests: evaluators and the choice of settings used seed 0
+# Look-ahead settings that the published agent uses, but training does not.
 AHEAD = {"push": {"tried": 16}}
 DEAR = ("table", "planner", "planner_told", "planner_wrong")  # rivals that would take hours
 
 
 class Candidate(NamedTuple):
-    """A finished run of one seed, with its final weights, and the content of its result.json."""
+    """A finished run of one seed with its final weights, and the content of result.json."""
 
     run: Run
     result: dict[str, Any]
@@ -51,23 +51,23 @@ class Candidate(NamedTuple):
 def publish(
     run_dirs: Sequence[Path], name: str, target: Path = PACKAGE, tests: int = TESTS
 ) -> Path:
-    """Write the folder of an agent: the run of the median seed, and a card about all of them.
+    """Write the folder of an agent: weights of the median seed, and a card about all seeds.
 
-    The median is that of the final score, the lower one of two; the best seed would promise more
-    than another training gives.
+    The run with the median final score is chosen (the lower one of two). The best seed would
+    promise more than a new training achieves.
 
     Args:
         run_dirs: finished runs of one setup, one for each seed.
-        name: of the agent: small letters, digits and underscores.
-        target: the agent's folder is made in here.
-        tests: episodes that the chosen weights are scored on again, other ones than in training.
+        name: name of the agent: lower-case letters, digits and underscores.
+        target: folder in which the agent's folder is made.
+        tests: number of new test episodes on which the chosen weights are scored again.
 
     Returns:
         The agent's folder.
 
     Raises:
-        RunError: a run is not finished, not of the same setup, or its weights are too large.
-        ConfigError: a name that cannot be one, or a folder that cannot be written.
+        RunError: a run is unfinished or has another setup, or the weights are too large.
+        ConfigError: the name is invalid, or the folder cannot be written.
     """
     if not (name.isascii() and name.isidentifier() and name == name.lower()):
         raise ConfigError(f"name must be small letters, digits and _, got '{name}'")
@@ -84,12 +84,12 @@ def publish(
     scores = score_policies(task, players, config)
     card = make_card(name, chosen, seeds)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
-    places = isinstance(task, Place) and task.sim.observe != "pictures"  # pieces that touch
+    places = isinstance(task, Place) and task.sim.observe != "pictures"  # pieces of figures touch
     if isinstance(task, Place) and places and has_all_tans(task.layout):
         card |= {"puzzles": {split: _on_figures(chosen.run, split) for split in FIGURES}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}
     folder = target / name
-    # What makes the setup, every value written out; a run's config also names its machine.
+    # Only the setup, with every value; the config of a run would also name its machine.
     content = yaml.safe_dump(chosen.run.setup.config(), sort_keys=False)
     write_whole(folder / CONFIG, content.encode())
     write_whole(folder / WEIGHTS, weights)
@@ -98,20 +98,20 @@ def publish(
 
 
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
-    """Scores of a run on the figures of a split."""
+    """Mean scores of a run on the figures of a split."""
     figures = find_figures(split, run.task, None, TURNS)
     scored = score_puzzles(run.task, figures, {RUN: by(run.actor)}, TEST_SEED)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 
 def median(seeds: Sequence[Candidate]) -> Candidate:
-    """The seed in the middle by its final score; of two, the lower one."""
+    """The candidate with the median final score; the lower one of two."""
     ranked = sorted(seeds, key=lambda one: float(one.result[_ranks(one.result)]))
     return ranked[(len(ranked) - 1) // 2]
 
 
 def _ranks(result: Mapping[str, Any]) -> str:
-    """The score by which runs are ranked."""
+    """Name of the score by which runs are ranked."""
     return "solved" if result.get("mean_reward") is None else "mean_reward"
 
 
@@ -128,7 +128,7 @@ def _read(run_dir: Path) -> Candidate:
         raise RunError(
             f"{run_dir} was scored after {result['scored_updates']} of its {result['updates']} "
             f"updates and holds weights of {run.updates}: the scores must be those of the final "
-            "weights, train it to its end"
+            "weights, so train it to its end"
         )
     return Candidate(run, result)
 
@@ -141,8 +141,8 @@ def _check_one_setup(seeds: Sequence[Candidate]) -> None:
         odd = first.run.setup.differences(one.run.setup.contents())
         if odd:
             raise RunError(
-                f"{one.run.folder} differs from {first.run.folder} in {', '.join(odd)}: the seeds "
-                "of an agent share all settings"
+                f"{one.run.folder} differs from {first.run.folder} in {', '.join(odd)}: name runs "
+                "that share all settings but the seed"
             )
     numbers = [one.result["seed"] for one in seeds]
     if len(set(numbers)) < len(numbers):
@@ -150,7 +150,7 @@ def _check_one_setup(seeds: Sequence[Candidate]) -> None:
 
 
 def _weights(run: Run) -> bytes:
-    """The acting actor in float32, as safetensors."""
+    """Weights of the acting actor in float32, in safetensors format."""
     path = newest_checkpoint(run.folder / CHECKPOINTS)
     tensors = load_checkpoint(path, [ACTING]).arrays[ACTING]
     single = {k: np.ascontiguousarray(v, np.float32) for k, v in sorted(tensors.items())}
@@ -163,12 +163,12 @@ def _weights(run: Run) -> bytes:
     return data
 
 
-# The card: what made the agent, and what it can do
+# The card: how the agent was trained, and its scores
 
-# What result.json says of a run's effort, for the card.
+# Keys of result.json about the cost of training.
 _BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "workers")
 
-# Its scores of each seed.
+# Keys of result.json for the scores of each seed.
 _SCORES = (
     *("solved", "placed", "pushes", "mean_reward", "coverage", "coverage_p10", "iou"),
     *("angle_error_deg_median", "position_error_median"),
@@ -176,12 +176,12 @@ _SCORES = (
 
 
 def make_card(name: str, chosen: Candidate, seeds: Sequence[Candidate]) -> dict[str, Any]:
-    """The content of card.json but for the tests, the puzzles and the checksum.
+    """The content of card.json except the tests, the puzzles and the checksum.
 
     Args:
-        name: of the agent.
-        chosen: the run that ships.
-        seeds: all runs, by seed.
+        name: name of the agent.
+        chosen: the run whose weights are published.
+        seeds: all runs, in the order of their seeds.
     """
     setup, result = chosen.run.setup, chosen.result
     world = setup.config()
@@ -210,13 +210,13 @@ def _picked(result: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def main() -> int:
-    """`python -m tangram_lab.experiments.pretrained NAME RUN_DIR...`."""
+    """Run `python -m tangram_lab.experiments.pretrained NAME RUN_DIR...`; return exit status."""
     program = "python -m tangram_lab.experiments.pretrained"
     parser = argparse.ArgumentParser(prog=program, description=__doc__)
-    parser.add_argument("name", help="of the agent, as in pretrained/NAME")
-    parser.add_argument("run_dirs", metavar="RUN_DIR", type=Path, nargs="+", help="one each seed")
-    parser.add_argument("--out", type=Path, default=PACKAGE, help="where its folder is made")
-    parser.add_argument("--tests", type=int, default=TESTS, help=f"scored again on ({TESTS})")
+    parser.add_argument("name", help="name of the agent, as in pretrained/NAME")
+    parser.add_argument("run_dirs", metavar="RUN_DIR", type=Path, nargs="+", help="a run per seed")
+    parser.add_argument("--out", type=Path, default=PACKAGE, help="folder to make NAME in")
+    parser.add_argument("--tests", type=int, default=TESTS, help=f"test episodes ({TESTS})")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""Tables and figures of a study, from its CSV; of a folder of runs one table."""
+"""Tables and figures of a study, from its CSV file; one table for a folder of runs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,8 +17,8 @@ from tangram_lab.experiments.runner import read_json
 from tangram_lab.experiments.studies import Figure, Study, read_studies
 from tangram_lab.figures import COLOURS, legend_below, new_figure, save
 
-GRID = 200  # points of a curve of several seeds
-NAMED = 6  # settings in the name of a row
+GRID = 200  # points of a mean curve over seeds
+NAMED = 6  # at most so many settings in the label of a row
 LABELS = {
     "mean_reward": "mean reward",
     "mean_reward_dense": "mean reward, dense",
@@ -30,9 +30,9 @@ LABELS = {
     "train_seconds": "training, s",
 }
 WHOLE = ("updates", "episodes", "parameters", "train_seconds")  # numbers without decimals
-RIVALS = {"position only": "--", "exact": ":"}  # levels beside curves
-DASHES = ("-.", (0, (1, 3)))  # of what is reported
-AXES = {  # of curves: what stands below, and up to where they are linear
+RIVALS = {"position only": "--", "exact": ":"}  # rival -> line style of its score beside curves
+DASHES = ("-.", (0, (1, 3)))  # line styles of scores that others report
+AXES = {  # x axis of curves -> label, and where it turns from linear to logarithmic
     "job": ("episodes of the paper", np.inf),
     "simulations": ("simulations", 1000),
     "episodes": ("episodes", 1000),
@@ -44,13 +44,13 @@ AXES = {  # of curves: what stands below, and up to where they are linear
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of Markdown; the columns after the first are numbers."""
+    """A Markdown table; all columns but the first are aligned right, as numbers."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def shown(spread: Spread, measure: str) -> str:
-    """Median (least to most), or one number where all seeds have it."""
+    """A spread as text: median (least to most), or one number if all seeds agree."""
 
     def text(value: float) -> str:
         return f"{value:,.0f}" if measure in WHOLE else f"{value:.4f}"
@@ -60,7 +60,7 @@ def shown(spread: Spread, measure: str) -> str:
 
 
 def page(title: str, csv: str, rows: pd.DataFrame) -> str:
-    """A page with a table of all trainings and tests, rivals under each."""
+    """A Markdown page with a table of all trainings and tests, each followed by its rivals."""
     measures = [name for name in (*SCORES, *RUN) if name in rows and rows[name].notna().any()]
     found = {name: spreads(rows, name) for name in measures}
     lines = []
@@ -79,8 +79,8 @@ def page(title: str, csv: str, rows: pd.DataFrame) -> str:
     head = ["agent or rival", "training", "test", "seeds"]
     commits = ", ".join(sorted(rows["commit"].dropna().unique()))
     return (
-        f"# {title}\n\nMedian over the seeds (least to most), of fixed tests without exploration. "
-        f"Under an agent stand its rivals, which learned nothing and played the same tests. "
+        f"# {title}\n\nMedian over the seeds (least to most), in fixed tests without exploration. "
+        f"Below each agent are its rivals, which learned nothing and played the same tests. "
         f"Every run is a row of [{csv}]({csv}), made at commits {commits}.\n\n"
         + table([*head, *(LABELS.get(name, name) for name in measures)], lines)
     )
@@ -90,14 +90,14 @@ def page(title: str, csv: str, rows: pd.DataFrame) -> str:
 
 
 def draw(figure: Figure, rows: pd.DataFrame, curves: pd.DataFrame | None) -> Canvas:
-    """One figure of a study's rows.
+    """Draw one figure from the rows and the learning curves of a study.
 
     Raises:
-        RunError: its curves or its rows are missing.
+        RunError: the rows or the curves of its trainings are missing.
     """
     names = [name for name in figure.trainings if name in {*rows["training"]}]
     if not names or (figure.kind == "curves" and curves is None):
-        raise RunError(f"nothing is there to draw of '{figure.title}': run its trainings first")
+        raise RunError(f"there are no results to draw '{figure.title}': run its trainings first")
     labels = dict(zip(rows["training"], rows["label"], strict=True))
     if figure.kind == "curves" and curves is not None:
         canvas = _curves(figure, names, labels, rows, curves)
@@ -116,7 +116,7 @@ def _curves(
     rows: pd.DataFrame,
     curves: pd.DataFrame,
 ) -> Canvas:
-    """Mean over the seeds and one standard deviation, over episodes and over seconds."""
+    """Learning curves in two panels: mean over the seeds and one standard deviation."""
     canvas, panels = new_figure(4.2, 2, sharey=True)
     count = curves["episodes"]
     whole = curves.assign(job=count / max(figure.job, 1), simulations=count)
@@ -136,7 +136,7 @@ def _curves(
         if most > 10.0 * linear:
             panel.set_xscale("symlog", linthresh=linear)
             decades = 10.0 ** np.arange(1, 12)
-            # Those below would lie over each other.
+            # Labels of smaller decades would overlap on the linear part of the axis.
             panel.set_xticks([0.0, *decades[(decades >= linear) & (decades <= most)]])
         for (name, levels), dash in zip(figure.reported.items(), DASHES, strict=False):
             panel.axhline(levels[0], color="#111827", linestyle=dash, label=name)
@@ -153,7 +153,7 @@ def _curves(
 def _tests(
     figure: Figure, names: Sequence[str], labels: dict[str, str], rows: pd.DataFrame
 ) -> Canvas:
-    """Scores over tests: median, and least to most as bars; rivals dotted."""
+    """Scores by test: the median, with bars from least to most; rivals as dotted lines."""
     canvas, (panel, *_) = new_figure(4.4)
     place = np.arange(len(figure.tests))
     found = spreads(rows, figure.measure)
@@ -179,7 +179,7 @@ def _tests(
 def _seeds(
     figure: Figure, names: Sequence[str], labels: dict[str, str], rows: pd.DataFrame
 ) -> Canvas:
-    """A dot for each seed, a tick at the median; a diamond for the rival that never turns."""
+    """Scores by training: dots for seeds, a tick for the median, a diamond for the rival."""
     canvas, (panel, *_) = new_figure(0.9 + 0.32 * len(names))
     here = rows[rows["test"] == figure.test]
     for place, (name, colour) in enumerate(zip(names, COLOURS * 2, strict=False)):
@@ -202,10 +202,10 @@ def _seeds(
 
 
 def write_report(runs: Path, out: Path) -> Iterator[Path]:
-    """Everything that can be told of a folder; yields each file as it is written.
+    """Write all tables and figures of a folder; yield each file as it is written.
 
     Raises:
-        RunError: neither runs nor the CSV of a study are there, or one cannot be read.
+        RunError: the folder has neither runs nor the CSV of a study, or a file cannot be read.
     """
     files = [path for path in sorted(runs.glob("*.csv")) if of_a_study(read_rows(path))]
     studies = read_studies().studies
@@ -217,7 +217,7 @@ def write_report(runs: Path, out: Path) -> Iterator[Path]:
 
 
 def write_study(name: str, study: Study, csv: Path, out: Path) -> Iterator[Path]:
-    """The page and the figures of a study; what has no rows yet is left out.
+    """Write the page and the figures of a study; figures without rows are left out.
 
     Raises:
         RunError: the CSV cannot be read.
@@ -239,14 +239,14 @@ def write_study(name: str, study: Study, csv: Path, out: Path) -> Iterator[Path]
 
 
 def write_runs(folder: Path, out: Path) -> Path:
-    """One table of a folder whose folders are runs, such as a sweep's: runs alike but for the seed.
+    """Write one table of a folder of runs, such as a sweep; runs that differ in seed share a row.
 
     Raises:
-        RunError: no run is there.
+        RunError: the folder has no runs.
     """
     configs = sorted(folder.glob(f"*/{CONFIG}"))
     if not configs:
-        raise RunError(f"{folder} has neither runs nor the CSV of a study: name another, runs=...")
+        raise RunError(f"{folder} has neither runs nor the CSV of a study: set runs=... to another")
     found = []
     for path in configs:
         result = read_json(path.parent / "result.json")
@@ -287,7 +287,7 @@ def write_runs(folder: Path, out: Path) -> Path:
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every setting with its dotted name."""
+    """Dotted name and value of every setting in nested sections."""
     for key, value in values.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")

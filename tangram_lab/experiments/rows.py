@@ -1,7 +1,7 @@
-"""The rows of a study as CSV: one for each test of each run, and for each rival that it had.
+"""The rows of a study as CSV: one row for each test of each run, and one for each rival in it.
 
-A rival learned nothing and plays the same tests; it has no seed where it scored the same beside
-every seed.
+A rival is a policy that learned nothing and plays the same tests. Its seed is empty if it scored
+the same in the runs of all seeds.
 """
 
 import csv
@@ -17,7 +17,7 @@ import pandas as pd
 from tangram_core.errors import RunError
 
 AGENT = "agent"
-# What scores were called before version 0.2, in files of that time; they are read for one version.
+# Old name of a score, before version 0.2 -> new name. Version 0.2 still reads the old names.
 OLD = {
     "raw_overlap": "coverage",
     "raw_overlap_p10": "coverage_p10",
@@ -40,21 +40,21 @@ SCORES = {
     "pushes": "pushes",
     "ms_per_choice": "ms_per_choice",
 }
-RUN = ("updates", "episodes", "parameters", "train_seconds")  # of the training
-LEVELS = {"reached_0.70": 0.70, "reached_0.75": 0.75}  # that the paper tells of
+RUN = ("updates", "episodes", "parameters", "train_seconds")  # columns about the training
+LEVELS = {"reached_0.70": 0.70, "reached_0.75": 0.75}  # column -> mean reward, as in the paper
 COLUMNS = (
     *("training", "label", "seed", "test", "policy", "commit", "tests"),
     *(*SCORES, "seconds_per_puzzle", *RUN, *LEVELS),
 )
 CURVE = ("training", "seed", "episodes", "updates", "train_seconds", *list(SCORES)[:2])
-POINTS = 30  # of a curve
-DIGITS = 6
+POINTS = 30  # at most so many points of a curve are written
+DIGITS = 6  # significant digits of a written number
 
 Row = Mapping[str, Any]
 
 
 class Spread(NamedTuple):
-    """Of the seeds of a training in a test."""
+    """Spread of a score over the seeds of a training, in one test."""
 
     median: float
     least: float
@@ -62,7 +62,7 @@ class Spread(NamedTuple):
 
 
 def tell_of_old(names: Iterable[str], path: Path) -> list[str]:
-    """Those names of a file that are old, with a warning if there are any."""
+    """The old names of scores among the names in a file; warn if there are any."""
     old = [name for name in names if name in OLD]
     if old:
         told = ", ".join(f"{name} is called {OLD[name]} now" for name in old)
@@ -72,10 +72,10 @@ def tell_of_old(names: Iterable[str], path: Path) -> list[str]:
 
 
 def read_rows(path: Path) -> pd.DataFrame:
-    """All rows of a CSV.
+    """All rows of a CSV file, with old names of scores replaced.
 
     Raises:
-        RunError: it cannot be read, or is none of a study.
+        RunError: the file cannot be read.
     """
     try:
         found = pd.read_csv(path, dtype={"training": str, "test": str, "commit": str})
@@ -89,12 +89,12 @@ def read_rows(path: Path) -> pd.DataFrame:
 
 
 def of_a_study(rows: pd.DataFrame) -> bool:
-    """Whether these are rows of runs."""
+    """Whether a table has the columns of a study."""
     return {"training", "test", "policy"} <= {*rows.columns}
 
 
 def spreads(rows: pd.DataFrame, measure: str) -> dict[tuple[str, str, str], Spread]:
-    """(training, test, policy) -> median, least and most of the seeds, where there are any."""
+    """(training, test, policy) -> spread of a score over the seeds; only groups that have it."""
     known = rows.dropna(subset=[measure])
     groups = known.groupby(["training", "test", "policy"], sort=False)[measure]
     found = groups.agg(["median", "min", "max"])
@@ -107,13 +107,13 @@ def spreads(rows: pd.DataFrame, measure: str) -> dict[tuple[str, str, str], Spre
 def rows_of(
     training: str, label: str, seed: int, test: str, result: Row, scores: Row, curve: Iterable[Row]
 ) -> list[dict[str, Any]]:
-    """The rows of one test of one run: the agent's, and those of its rivals.
+    """The rows of one test of one run: the row of the agent, then those of its rivals.
 
     Args:
-        training, label, seed, test: what was done.
-        result: result.json of the run.
-        scores: what tangram-eval wrote.
-        curve: the run's evaluations while it learned.
+        training, label, seed, test: values for these columns.
+        result: content of the run's result.json.
+        scores: content of the file that tangram-eval wrote.
+        curve: evaluations during the training.
     """
     points = list(curve)
     tests = scores.get("episodes") or len(scores.get("puzzles", ())) * (scores.get("turns") or 1)
@@ -131,7 +131,7 @@ def rows_of(
 
 
 def _reached(curve: list[Row], level: float) -> str:
-    """Between which episodes a mean reward was first reached; nobody looked between."""
+    """The two evaluations, in episodes, between which a mean reward was first reached."""
     before = 0
     for point in curve:
         score = point.get("mean_reward")
@@ -142,7 +142,7 @@ def _reached(curve: list[Row], level: float) -> str:
 
 
 def curve_rows(training: str, seed: int, curve: list[Row]) -> list[dict[str, Any]]:
-    """At most 30 points of a curve, evenly picked, the first and the last among them."""
+    """Rows for at most 30 evenly spaced points of a curve, with the first and the last."""
     last = len(curve) - 1
     count = min(len(curve), POINTS)
     picked = sorted({round(step * last / max(count - 1, 1)) for step in range(count)})
@@ -155,7 +155,7 @@ def curve_rows(training: str, seed: int, curve: list[Row]) -> list[dict[str, Any
 
 
 def append(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
-    """Add rows at a CSV's end, at once; its head first where it is new."""
+    """Append rows to a CSV file in one write; a new file begins with the header."""
     head = list(columns)
     if path.exists():
         with path.open(encoding="utf-8", newline="") as file:
@@ -165,7 +165,7 @@ def append(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         writer.writeheader()
-    old = {OLD[name]: name for name in head if name in OLD}  # a file keeps its columns
+    old = {OLD[name]: name for name in head if name in OLD}  # an old file keeps its column names
     writer.writerows(
         {old.get(name, name): _written(value) for name, value in row.items()} for row in rows
     )
@@ -180,7 +180,7 @@ def _written(value: object) -> object:
 
 
 def done(path: Path) -> set[tuple[str, int, str]]:
-    """(training, seed, test) of the agent's rows that a CSV has."""
+    """(training, seed, test) of all agent rows in a CSV file; empty without the file."""
     if not path.exists():
         return set()
     rows = read_rows(path)

@@ -1,4 +1,4 @@
-"""Runs what a study lacks: trains with real processes, tests with tangram-eval, adds rows."""
+"""Do the missing jobs of a study: train, test with tangram-eval, and add rows to its CSV file."""
 
 import json
 import signal
@@ -31,19 +31,19 @@ from tangram_lab.experiments.studies import Job, StudyConfig
 
 TOLD = "told.json"
 LOOK_S = 0.5
-STOP_S = 60.0  # a training that is asked to end writes its checkpoint first
+STOP_S = 60.0  # time for a stopped training to write its checkpoint
 FAILED_STATUS, INTERRUPT_STATUS = 1, 130
-BUDGET = ("max_updates", "max_episodes", "max_hours")  # how a training ends that is whole
+BUDGET = ("max_updates", "max_episodes", "max_hours")  # `ended_by` of a finished training
 
 
 class Work:
-    """One training with one seed, then its tests, as one process after another.
+    """One job: a training with one seed, then its tests, one process after the other.
 
     Args:
-        job: what it is.
-        run_dir: its own.
-        missing: tests without a row.
-        first: whose agent it goes on with.
+        job: the training and its tests.
+        run_dir: folder of this run.
+        missing: names of the tests without a row.
+        first: the work whose agent is trained further; None to begin anew.
     """
 
     def __init__(
@@ -53,29 +53,29 @@ class Work:
 
     @property
     def trained(self) -> bool:
-        """Whether the run used up its budget."""
+        """Whether the training has used its whole budget."""
         return str(read_json(self.run_dir / "result.json").get("ended_by")).startswith(BUDGET)
 
     @property
     def ready(self) -> bool:
-        """Whether nothing has to be trained before it."""
+        """Whether the work may begin: the training before it, if any, is finished."""
         return self.first is None or self.first.trained or self.trained
 
     def scores(self, test: str) -> Path:
-        """The file that a test leaves."""
+        """Path of the file with the scores of a test."""
         return self.run_dir / "tests" / f"{test}.json"
 
     def check(self) -> None:
-        """Raise ConfigError if the run was begun with other settings."""
+        """Raise ConfigError if the run in this folder was begun with other settings."""
         told = read_json(self.run_dir / TOLD).get("told", list(self.job.told))
         if told != list(self.job.told):
             raise ConfigError(
-                f"{self.run_dir} was begun with {' '.join(told)}: remove it, or choose another "
-                "run_dir"
+                f"{self.run_dir} was begun with {' '.join(told)}: remove this folder, or choose "
+                "another run_dir"
             )
 
     def next(self) -> Child | None:
-        """The process that comes next; None where all is done."""
+        """The next process to start; None if all are done."""
         if not self.trained:
             told = ["train", override("run_dir", str(self.run_dir)), f"seed={self.job.seed}"]
             if self.first:
@@ -94,7 +94,7 @@ class Work:
         return Child(self.job.name, told, self.run_dir / log)
 
     def write(self, folder: Path, study: str) -> str:
-        """Add the rows of all tests, and of a curve that is drawn; returns what to tell."""
+        """Append the rows of all tests, and the curve if a figure needs it; return a summary."""
         job, result = self.job, read_json(self.run_dir / "result.json")
         lines = (self.run_dir / "curve.jsonl").read_text(encoding="utf-8").splitlines()
         curve = [json.loads(line) for line in lines]
@@ -111,7 +111,7 @@ class Work:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; empty where the file is missing or cannot be read."""
+    """The JSON object in a file; empty if the file is missing or cannot be read."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -124,13 +124,13 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int:
-    """Do what is missing.
+    """Run all jobs that have no rows yet.
 
     Returns:
-        Exit status: 0 when all is done, 1 when something failed, 130 after a signal.
+        Exit status: 0 if all are done, 1 if a job failed, 130 after a signal.
 
     Raises:
-        ConfigError: the folder is in use, or cannot be made.
+        ConfigError: the folder is in use or cannot be made, or has a run with other settings.
     """
     root, out = Path(config.run_dir), Path(config.out or config.run_dir)
     there = done(out / f"{config.study}.csv")
@@ -141,7 +141,7 @@ def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int
         first = works[job.after, job.seed] if job.after else None
         works[job.training, job.seed] = Work(job, run_dir, missing, first)
     wanted = list[Work]()
-    for work in reversed(works.values()):  # whoever goes on with another comes after it
+    for work in reversed(works.values()):  # reversed: a training comes after its `first`
         if work.missing or any(then.first is work and not then.trained for then in wanted):
             work.check()
             wanted.insert(0, work)
@@ -153,7 +153,7 @@ def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int
 
 
 class Runner:
-    """Keeps so many trainings going, until nothing is left or a signal comes."""
+    """Does up to `config.jobs` pieces of work at a time, until all are done or a signal arrives."""
 
     def __init__(
         self, wanted: Sequence[Work], config: StudyConfig, out: Path, console: Console
@@ -166,14 +166,14 @@ class Runner:
         self._stop_s: float | None = None
 
     def run(self) -> int:
-        """Until nothing is left to do; returns the exit status."""
+        """Do all the work; return the exit status as in `run_study`."""
         with handling(self._events.put, SIGNALS):
             try:
                 self._work()
             finally:
-                self._signal(signal.SIGTERM)  # nobody is left, unless this failed
+                self._signal(signal.SIGTERM)  # children are left only after an exception
         if self._stop_s is not None:
-            self._console.print("stopped: give the same command again to go on")
+            self._console.print("stopped: repeat the same command to continue")
             return INTERRUPT_STATUS
         return FAILED_STATUS if self._failed else 0
 
@@ -188,7 +188,7 @@ class Runner:
             if not self._running:
                 for work in self._waiting if self._stop_s is None else ():
                     self._failed.append(work)
-                    self._tell(work, "not begun, as the training before it failed")
+                    self._tell(work, "not begun, because the training before it failed")
                 return
             try:
                 self._take(self._events.get(timeout=LOOK_S))
@@ -208,7 +208,7 @@ class Runner:
 
     def _take(self, event: Child | signal.Signals) -> None:
         if isinstance(event, signal.Signals):
-            # The first wish ends the trainings with a checkpoint, a later one at once.
+            # The first signal ends the trainings with a checkpoint, a second one at once.
             self._signal(signal.SIGTERM if self._stop_s is None else signal.SIGKILL)
             self._stop_s = self._stop_s or time.monotonic() + STOP_S
             return

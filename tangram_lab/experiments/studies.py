@@ -1,4 +1,4 @@
-"""The studies of conf/studies.yaml: which agents are trained, over which seeds, and how tested."""
+"""The studies of conf/studies.yaml: their trainings, seeds, tests and figures."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,13 +16,13 @@ Overrides = tuple[str, ...]
 
 
 class Budget(msgspec.Struct, forbid_unknown_fields=True):
-    """How long everything is trained and tested.
+    """How long every training and test of a study is.
 
     Attributes:
-        seeds: of every training, at most.
+        seeds: largest number of seeds of a training.
         tests: episodes of every test.
-        test_seed: of these episodes.
-        set: what every training is told.
+        test_seed: seed of the test episodes.
+        set: settings of every training.
     """
 
     seeds: int
@@ -32,15 +32,15 @@ class Budget(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Training(msgspec.Struct, forbid_unknown_fields=True):
-    """One setting, trained once for every seed.
+    """One configuration of an agent, trained once for every seed.
 
     Attributes:
-        label: for tables and figures.
-        family: what it has in common with others.
-        tests: names of tests.
-        set: what it alone is told.
-        seeds: how many, instead of the study's; not more than those of `after`.
-        after: an earlier training, whose agent of the same seed it goes on with.
+        label: name in tables and figures.
+        family: name of the family whose settings the training uses.
+        tests: names of its tests.
+        set: settings of this training alone.
+        seeds: number of seeds instead of the study's; at most as many as `after` has.
+        after: an earlier training; its agent of the same seed is trained further.
     """
 
     label: str
@@ -52,18 +52,19 @@ class Training(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Figure(msgspec.Struct, forbid_unknown_fields=True):
-    """A figure of a study's rows.
+    """A figure drawn from the rows of a study.
 
     Attributes:
-        kind: curves while learning; scores over several tests; or those of every seed in one test.
-        title: above it.
-        trainings: from the first to the last.
+        kind: "curves": learning curves; "tests": scores in several tests; "seeds": the score of
+            every seed in one test.
+        title: text above the figure.
+        trainings: names of the trainings, in the order of drawing.
         measure: the column that is drawn.
-        tests: of the kind `tests`.
-        test: of the kind `seeds`.
-        reported: what somebody else reports: name -> a level, or a score for each test.
-        job: episodes of ours in one of the paper's, which the first panel of curves counts; 0: the
-            second panel counts seconds.
+        tests: names of the tests, for kind "tests".
+        test: name of the test, for kind "seeds".
+        reported: scores that others report: name -> one score, or one for each test.
+        job: how many of our episodes make one of the paper's; the axes of curves are then paper
+            episodes and simulations. 0: the axes are our episodes and seconds.
     """
 
     kind: Literal["curves", "tests", "seeds"]
@@ -77,13 +78,13 @@ class Figure(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Study(msgspec.Struct, forbid_unknown_fields=True):
-    """Trainings whose rows stand in one CSV.
+    """Trainings that share one CSV file of results.
 
     Attributes:
-        title: of its page.
-        seeds: of a training that says nothing else.
-        trainings: by name.
-        figures: by the names of their files.
+        title: title of the page.
+        seeds: number of seeds of a training, unless the training has its own.
+        trainings: name -> training.
+        figures: name of the file -> figure.
     """
 
     title: str
@@ -93,7 +94,14 @@ class Study(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Studies(msgspec.Struct, forbid_unknown_fields=True):
-    """The whole file; a family has `set`, and what it is told in each budget."""
+    """The content of conf/studies.yaml.
+
+    Attributes:
+        budgets: name -> budget.
+        families: name -> settings: those under "set", and more under the name of a budget.
+        tests: name -> settings of tangram-eval.
+        studies: name -> study.
+    """
 
     budgets: dict[str, Budget]
     families: dict[str, dict[str, Overrides]]
@@ -102,10 +110,10 @@ class Studies(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_studies(path: Path = FILE) -> Studies:
-    """The file, checked.
+    """Read and check a file of studies.
 
     Raises:
-        ConfigError: it is no file of studies, or names what it has not.
+        ConfigError: the file is invalid, or a training names something that does not exist.
     """
     try:
         found = msgspec.convert(yaml.safe_load(path.read_text(encoding="utf-8")), Studies)
@@ -128,14 +136,16 @@ def read_studies(path: Path = FILE) -> Studies:
 
 @dataclass(frozen=True)
 class StudyConfig(Settings):
-    """A study, and where and how it is run."""
+    """Settings of tangram-experiment."""
 
-    run_dir: str = field(metadata=declared("folder of all runs; what is there goes on"))
-    study: str = setting("paper", "of conf/studies.yaml: paper, token, parts, game, ...")
+    run_dir: str = field(metadata=declared("folder of all runs; unfinished runs in it are resumed"))
+    study: str = setting("paper", "a study of conf/studies.yaml: paper, token, parts, game, ...")
     budget: str = setting("laptop", "smoke (a minute), laptop or paper (hours)")
-    seeds: int | None = setting(None, "of every training, at most; null is the budget's", low=1)
+    seeds: int | None = setting(
+        None, "largest number of seeds of a training; null: that of the budget", low=1
+    )
     out: str | None = setting(
-        None, "folder of STUDY.csv; rows that are there are not made again; null is run_dir"
+        None, "folder of STUDY.csv; tests with a row there are not run again; null: run_dir"
     )
     jobs: int = setting(2, "trainings at a time; a learner keeps one core busy", low=1, high=1024)
 
@@ -151,11 +161,11 @@ class Job:
     """One training with one seed, and its tests.
 
     Attributes:
-        training, label, seed: of its rows.
-        told: what tangram-train is told.
-        tests: name -> what tangram-eval is told.
-        drawn: whether a figure shows how it learned.
-        after: the training that it goes on with.
+        training, label, seed: values for these columns of the rows.
+        told: settings for tangram-train.
+        tests: name -> settings for tangram-eval.
+        drawn: whether a figure shows the learning curve.
+        after: name of the training whose agent is trained further; None to begin anew.
     """
 
     training: str
@@ -168,15 +178,15 @@ class Job:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the training with its seed, for messages."""
         return f"{self.training}, seed {self.seed}"
 
 
 def jobs_of(config: StudyConfig, known: Studies) -> Iterator[Job]:
-    """Everything that a study consists of, seed by seed.
+    """All jobs of a study, seed by seed.
 
     Raises:
-        ConfigError: there is no such study or budget.
+        ConfigError: the study or the budget does not exist.
     """
     check_choice("study", config.study, tuple(known.studies))
     check_choice("budget", config.budget, tuple(known.budgets))
@@ -197,14 +207,17 @@ def jobs_of(config: StudyConfig, known: Studies) -> Iterator[Job]:
 
 
 def train_overrides(known: Studies, budget: str, training: Training) -> Overrides:
-    """What a training is told, each setting once: the last word counts."""
+    """Settings of a training, each once; a later setting replaces an earlier one.
+
+    The order is: family, budget, family in this budget, training.
+    """
     family = known.families[training.family]
     said = (*family["set"], *known.budgets[budget].set, *family.get(budget, ()), *training.set)
     return tuple({text.partition("=")[0]: text for text in said}.values())
 
 
 def _test(told: Overrides, budget: Budget) -> Overrides:
-    """What tangram-eval is told; puzzles are as many as there are."""
+    """Settings of tangram-eval for a test; a test on puzzles always plays all of them."""
     puzzles = any(text.startswith("puzzle=") for text in told)
     count = () if puzzles else (f"episodes={budget.tests}",)
     return (*count, f"seed={budget.test_seed}", *told)

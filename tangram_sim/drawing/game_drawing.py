@@ -1,4 +1,4 @@
-"""Pictures of the game: tokens over the silhouette of their target, perhaps one being moved."""
+"""Pictures of the game: tokens over the silhouette of their target, one perhaps in motion."""
 
 import math
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ _EDGE = (168, 158, 138)
 _OPACITY = 0.9
 _INK = (31, 41, 55)
 _RED = (200, 40, 40)
-_NEARER = 0.12  # how much larger a piece in the hand looks
+_NEARER = 0.12  # how much larger a lifted piece is drawn
 _FINGER = 0.04  # its radius
 _SHADOW = 0.35  # its opacity
 _SHADOW_WAY = (0.03, -0.05)  # of the arena, to the right and down
@@ -44,9 +44,9 @@ class Held:
 
     Attributes:
         token: its number.
-        height: 0 on the table to 1 in the air: drawn larger, with a shadow.
-        stopped: it cannot be set down: drawn with a red outline.
-        finger: (2,) of the middle of what pushes it.
+        height: from 0 (on the table) to 1 (in the air): drawn larger, with a shadow.
+        stopped: whether it cannot be set down: drawn with a red outline.
+        finger: (2,) centre of the finger that pushes it; None: no finger.
     """
 
     token: int
@@ -68,13 +68,13 @@ def draw_game(
     Args:
         layout: which corners belong to which token.
         arena: width of the arena, the same unit as the corners.
-        corners: (V, 2) of the tokens; what lies outside the arena is cut at the picture's edge.
+        corners: (V, 2) of the tokens; parts outside the picture are cut off.
         goal: (V, 2) of the target.
         size: side in pixels.
-        held: the piece that is moved, drawn above the others.
+        held: the piece in motion, drawn above the others.
     """
     canvas = empty_table(size * SAMPLES)
-    # The target as one figure: its fill hides the inner half of every piece's edge.
+    # The target appears as one figure: the fill hides the inner half of every piece's edge.
     targets = to_outlines(layout, arena, goal, canvas.width)
     for target in targets:
         draw_outline(canvas, target, _EDGE, 2.0)
@@ -93,7 +93,7 @@ def draw_game(
 def figure_sheet(
     layout: Layout, arena: float, ends: Floats, goals: Floats, titles: Sequence[str]
 ) -> Image.Image:
-    """One picture for each of E figures, with its name and how much of it is covered below.
+    """A sheet with one picture for each of E figures, captioned with name and covered share.
 
     `ends` and `goals` are corners (E, V, 2) of tokens and targets.
     """
@@ -105,13 +105,13 @@ def figure_sheet(
 
 
 def captions(layout: Layout, ends: Floats, goals: Floats, titles: Sequence[str]) -> list[str]:
-    """Each figure's name and the share of it that is covered, in per cent."""
+    """The name and the covered share (per cent) of each figure, as a text."""
     covered = covered_share(ends, goals, layout)
     return [f"{title}   {100 * share:.1f} %" for title, share in zip(titles, covered, strict=True)]
 
 
 def tiles(count: int, width: int) -> tuple[int, int]:
-    """How many pictures stand in a row of so many pixels, and the side of each in pixels."""
+    """The number of pictures in a row, and the side of each, for a sheet of `width` pixels."""
     columns = min(math.ceil(math.sqrt(1.4 * count)), count)
     return columns, min(max(width // columns, _MIN_TILE), _MAX_TILE)
 
@@ -131,7 +131,7 @@ def _draw_held(canvas: Image.Image, arena: float, held: Held, corners: Floats) -
 
 
 def _draw_shadow(canvas: Image.Image, outline: Sequence[Point], height: float) -> None:
-    """A soft dark polygon: softer and paler the higher the piece hangs."""
+    """Draw a blurred dark polygon; the blur grows with the height of the piece."""
     blur = _SHADOW_BLUR * canvas.width * height
     room = 3.0 * blur
     low = np.floor(np.min(outline, axis=0) - room).astype(int)

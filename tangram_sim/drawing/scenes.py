@@ -1,6 +1,6 @@
-"""Pictures of scenes from corners only: no engine, no camera.
+"""Pictures of scenes, drawn from corners without engine or camera.
 
-Tokens are drawn filled over the pale target; whole episodes come as contact sheets or GIFs.
+Filled tokens lie over the pale target. Several pictures make a contact sheet, a GIF or a film.
 """
 
 import math
@@ -33,7 +33,7 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import covered_share
 
 _OPACITY = 0.8  # of a token, so that the target shows through
-_PALETTE_FRAMES = 40  # that a film's colours are taken from
+_PALETTE_FRAMES = 40  # frames from which the colours of a GIF are chosen
 _GHOST = 0.18  # opacity of a token where it started
 SMALLEST_TEXT = 9  # pixels
 START, WAY, END, GOAL = MARKS = ("start", "way", "end", "target")
@@ -54,11 +54,11 @@ def draw_scene(
     Args:
         layout: which corners belong to which token.
         arena: width of the arena, the same unit as the corners.
-        corners: (V, 2) of the tokens; what lies outside the arena is cut at the picture's edge.
+        corners: (V, 2) of the tokens; parts outside the picture are cut off.
         goal: (V, 2) of the targets.
         size: side in pixels.
-        active: the token to mark by a dark outline, if any.
-        start: (V, 2) of the tokens at first: a pale ghost and the way from there, if given.
+        active: number of the token to mark by a thick outline, if any.
+        start: (V, 2) first corners of the tokens, if any: drawn pale, with the way from there.
     """
     canvas = empty_table(size * SAMPLES)
     pieces = to_outlines(layout, arena, corners, canvas.width)
@@ -86,10 +86,10 @@ def episode_sheet(
     size: int = 240,
     shares: Floats | None = None,
 ) -> Image.Image:
-    """One picture for each of E episodes with its overlap below, and one legend for all of them.
+    """A sheet with one picture for each of E episodes, captioned with its overlap, and a legend.
 
     `starts`, `ends` and `goals` are corners (E, V, 2) of tokens and targets; `size` is the side of
-    one picture in pixels. `shares` (E,) stand for the overlap where not all tokens are there.
+    one picture in pixels. `shares` (E,) replaces the overlap in episodes without all tokens.
     """
     starts, ends, goals = (np.asarray(part, np.float64) for part in (starts, ends, goals))
     scenes = [
@@ -103,10 +103,9 @@ def episode_sheet(
 
 
 def with_legend(sheet: Image.Image, text: int) -> Image.Image:
-    """The sheet, and below it what its shapes and numbers mean, in letters of `text` pixels.
+    """The sheet with a legend of its shapes and numbers below, in letters of `text` pixels.
 
-    Words that do not fit beside each other go on in the next line; a sheet that is narrower than
-    the longest of them is widened.
+    A long legend takes several lines. A sheet narrower than the longest entry is widened.
     """
     font, gap = ImageFont.load_default(text), text // 2
     indents = [text + gap] * len(MARKS) + [0] * len(MEANING)
@@ -132,7 +131,7 @@ def with_legend(sheet: Image.Image, text: int) -> Image.Image:
 
 
 def _mark(name: str, side: int) -> Image.Image:
-    """A small square as the pictures show it, or the way."""
+    """The mark of a legend entry: a small square, or a dashed line for the way."""
     canvas = Image.new("RGB", (side * SAMPLES, side * SAMPLES), PAPER)
     low, high, middle = 1.0 * SAMPLES, (side - 2.0) * SAMPLES, side * SAMPLES / 2.0
     square, colour = [(low, low), (high, low), (high, high), (low, high)], colour_of(0)
@@ -155,7 +154,7 @@ def contact_sheet(
     """Pictures of equal size side by side, row after row, each with its caption below.
 
     Raises:
-        ValueError: no pictures, or captions that are not one per picture.
+        ValueError: there are no pictures or columns, or captions do not match the pictures.
     """
     if not images or columns < 1:
         raise ValueError("a contact sheet needs at least one picture and one column")
@@ -183,10 +182,10 @@ def contact_sheet(
 def save_gif(
     images: Sequence[Image.Image], target: Path | BinaryIO, milliseconds: int = 400
 ) -> None:
-    """An endless animation of at least one picture, each shown for `milliseconds`."""
+    """Write an endless animation of at least one picture, each shown for `milliseconds`."""
     if not images:
         raise ValueError("an animation needs at least one picture")
-    # One palette for all frames, from frames all over the film: colours must not flicker.
+    # One palette for all frames, from frames all over the film, so that colours do not flicker.
     some = images[:: -(-len(images) // _PALETTE_FRAMES)]
     strip = contact_sheet(some, columns=len(some))
     palette = strip.quantize(128, dither=Image.Dither.NONE)
@@ -203,14 +202,14 @@ def save_gif(
 
 
 def save_mp4(images: Sequence[Image.Image], target: BinaryIO, milliseconds: int = 400) -> None:
-    """A film in H.264, which every browser and slide shows; ImportError if PyAV is missing."""
+    """Write a film in H.264, which all browsers play; ImportError if PyAV is missing."""
     if not images:
         raise ValueError("a film needs at least one picture")
     import av  # noqa: PLC0415 - optional
 
     with av.open(target, "w", format="mp4") as film:
         stream = film.add_stream("libx264", Fraction(1000, milliseconds), {"crf": "20"})
-        # Players want every colour's sample shared by two by two pixels: sides must be even.
+        # Players need colours at half the resolution (yuv420p), so sides must be even.
         stream.width, stream.height = (side + side % 2 for side in images[0].size)
         stream.pix_fmt = "yuv420p"
         for image in images:
@@ -223,7 +222,7 @@ def save_mp4(images: Sequence[Image.Image], target: BinaryIO, milliseconds: int 
 def _draw_starts(
     canvas: Image.Image, ghosts: Sequence[list[Point]], pieces: Sequence[list[Point]]
 ) -> None:
-    """A pale ghost of each token where it started, and a dashed line from there to where it is."""
+    """Draw each token pale where it started, and a dashed line from there to its place."""
     for k, ghost in enumerate(ghosts):
         fill(canvas, ghost, colour_of(k), _GHOST)
     for k, (ghost, piece) in enumerate(zip(ghosts, pieces, strict=True)):

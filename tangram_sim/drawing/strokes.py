@@ -1,7 +1,7 @@
-"""Strokes of pictures for people: colours, outlines, fills and dashes, drawn large and averaged.
+"""Drawing primitives of pictures for people: colours, outlines, fills and dashed lines.
 
-Canvases are SAMPLES times as large as what is shown, so that edges are smooth. Points are in pixels
-of the canvas, y down.
+A canvas is SAMPLES times as large as the final picture and is averaged at the end, so that edges
+are smooth. Points are in pixels of the canvas, y down.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ Colour = tuple[int, int, int]
 
 
 def empty_table(side: int) -> Image.Image:
-    """A square canvas of `side` pixels with the arena's frame."""
+    """A square canvas of `side` pixels with the frame of the arena."""
     canvas = Image.new("RGB", (side, side), PAPER)
     edge = MARGIN * side
     frame = (edge, edge, side - edge, side - edge)
@@ -50,20 +50,20 @@ def shown(canvas: Image.Image) -> Image.Image:
 
 
 def to_points(arena: float, corners: Floats, side: int) -> list[Point]:
-    """Points of the arena (M, 2) on a canvas."""
+    """Points (M, 2) of the arena as points of a canvas with `side` pixels."""
     scale = side * (1.0 - 2.0 * MARGIN) / arena
     pixels = np.asarray(corners, dtype=np.float64) * (scale, -scale) + side / 2.0
     return [(float(x), float(y)) for x, y in pixels]
 
 
 def to_outlines(layout: Layout, arena: float, corners: Floats, side: int) -> list[list[Point]]:
-    """The outline of each token with corners (V, 2) on a canvas."""
+    """The outlines of tokens with corners (V, 2), on a canvas with `side` pixels."""
     points = to_points(arena, corners, side)
     return [points[layout.corners_of(k)] for k in range(layout.tokens)]
 
 
 def fill(canvas: Image.Image, outline: Sequence[Point], colour: Colour, opacity: float) -> None:
-    """Lay a colour over a polygon; what is outside of the canvas is cut."""
+    """Fill a polygon with a colour; parts outside the canvas are cut off."""
     low = np.floor(np.min(outline, axis=0)).astype(int)
     size = np.ceil(np.max(outline, axis=0)).astype(int) - low + 1
     mask = Image.new("L", (int(size[0]), int(size[1])), 0)
@@ -78,7 +78,7 @@ def colour_of(token: int) -> Colour:
 
 
 def darker(colour: Colour) -> Colour:
-    """The same colour for an outline."""
+    """A darker shade of a colour, for an outline."""
     red, green, blue = (channel * 6 // 10 for channel in colour)
     return red, green, blue
 
@@ -86,7 +86,7 @@ def darker(colour: Colour) -> Colour:
 def draw_outline(
     canvas: Image.Image, outline: Sequence[Point], colour: Colour, width: float
 ) -> None:
-    """Draw a closed line, its width a multiple of a token's outline."""
+    """Draw a closed line; `width` is in widths of a token's outline."""
     closed = [*outline, outline[0], outline[1]]
     ImageDraw.Draw(canvas).line(closed, colour, round(width * 1.4 * SAMPLES), joint="curve")
 
@@ -94,13 +94,13 @@ def draw_outline(
 def draw_dashes(
     canvas: Image.Image, points: Sequence[Point], colour: Colour, closed: bool = True
 ) -> None:
-    """Draw a dashed line whose points are always drawn; a closed one ends where it began."""
+    """Draw a dashed line with a dash at every point; a closed one returns to the first point."""
     draw = ImageDraw.Draw(canvas)
     ahead = [*points[1:], points[0]] if closed else points[1:]
     for start, end in zip(points, ahead, strict=False):
         (x, y), (to_x, to_y) = start, end
         length = float(np.hypot(to_x - x, to_y - y))
-        # An odd number of equal parts, drawn and left out in turn: ends and begins with a dash.
+        # An odd number of equal parts, every other one drawn: the first and the last are dashes.
         parts = 2 * max(round(length / (10.0 * SAMPLES)), 1) + 1
         for i in range(0, parts, 2):
             ends = [(x + (to_x - x) * j / parts, y + (to_y - y) * j / parts) for j in (i, i + 1)]

@@ -1,6 +1,6 @@
-"""Areas that tokens cover or leave: polygons with holes, of several parts.
+"""Areas that tokens cover or leave free: polygons of several parts, with holes.
 
-Points are complex numbers here, in whatever unit an area has.
+Points are complex numbers here, in the unit of their area.
 """
 
 from typing import TypeAlias
@@ -13,18 +13,18 @@ from tangram_core.arrays import Complex
 
 Area: TypeAlias = "Polygon | MultiPolygon"
 
-_ROUND = 1e-9  # of an area's size, to which corners are rounded where areas are intersected
-_MITRE = 5.0  # of the sharpest corner, 45 degrees: 2.6
+_ROUND = 1e-9  # grid for the corners of an intersection, as a share of the areas' size
+_MITRE = 5.0  # largest mitre ratio; the sharpest corner, 45 degrees, needs 2.6
 
 
-@np.errstate(invalid="ignore", divide="ignore")  # of corners all but within a straight side
+@np.errstate(invalid="ignore", divide="ignore")  # at corners that are nearly straight
 def grown(area: Area, distance: float) -> Area:
-    """An area with all sides so far further out, or in where the distance is negative."""
+    """An area with all sides moved outwards by a distance, or inwards by a negative one."""
     return valid(shapely.buffer(area, distance, join_style="mitre", mitre_limit=_MITRE))
 
 
 def valid(area: Area) -> Area:
-    """The same area by rings that do not cross: what crosses breaks whatever is done with it."""
+    """The same area with rings that do not cross: other functions need such rings."""
     if shapely.is_valid(area):
         return area
     return shapely.union_all(polygons(shapely.make_valid(area)))
@@ -36,7 +36,7 @@ def opened(area: Area, tolerance: float) -> Area:
 
 
 def straightened(z: Complex, tolerance: float) -> Complex:
-    """Corners (n,) of a ring without those that lie within a straight side, or on another."""
+    """Corners (n,) of a ring, without repeated ones and those within a straight side."""
     z = z[np.abs(z - np.roll(z, 1)) > 0.5 * tolerance]
     while len(z) > 3:
         before = np.roll(z, 1)
@@ -57,9 +57,9 @@ def overlap(one: Area, other: Area) -> float:
 
 
 def rings(area: Area, tolerance: float) -> list[tuple[Complex, int, bool]]:
-    """Each ring of an area: its corners (n,), the part it belongs to, and whether it is outside.
+    """The rings of an area: corners (n,), number of the part, and whether it is an outer ring.
 
-    Counter-clockwise, holes clockwise: the area lies to the left of every side.
+    Outer rings are counter-clockwise, holes clockwise: the area lies to the left of every side.
     """
     found = []
     for part, polygon in enumerate(polygons(area)):
@@ -73,6 +73,6 @@ def rings(area: Area, tolerance: float) -> list[tuple[Complex, int, bool]]:
 
 
 def polygons(area: Area) -> list[Polygon]:
-    """The parts of an area; none of an empty one."""
+    """The parts of an area; an empty list for an empty area."""
     parts = shapely.get_parts(area).tolist()
     return [one for one in parts if one.geom_type == "Polygon" and not one.is_empty]

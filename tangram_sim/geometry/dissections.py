@@ -1,11 +1,11 @@
-"""An outline -> where tokens lie that fill it: a complete search, corner by corner.
+"""A complete search for poses of tokens that fill an outline, corner by corner.
 
-At a convex corner of what is left to fill some token must have a corner of its own, with an edge
-along the side that leaves it: so few places are possible, whatever the angle. The corner with the
-fewest of them is filled next. What is left must consist of parts that have the areas of tokens.
+The rest is the area that is still to fill. At each of its convex corners some token must have a
+corner too, with an edge along a side of the rest. So only few places are possible. The search goes
+on at the corner with the fewest places. Each part of the rest must have the area of some tokens.
 
 Points and directions are complex numbers here. Legend: S different shapes, n candidates, C corners
-of a token, filled up to those of the largest by repeating the last one.
+of a token, padded to those of the largest by repeating the last one.
 """
 
 import time
@@ -24,16 +24,16 @@ from tangram_sim.geometry.areas import Area, grown, opened, polygons, rings, val
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.sides import Side, sides_of
 
-_SLACK = 0.35  # of the smallest token's area, by which a part's may be wrong
-_DUST = 0.2  # of it: smaller parts are left unfilled
-_GRID = 1e-7  # of the root of all tokens' area, to which corners are rounded
-_TURN = np.radians(1.0)  # by which a corner may be wrong, and more where its sides are short
+_SLACK = 0.35  # error allowed in a part's area, as a share of the smallest token's area
+_DUST = 0.2  # parts below this share of the smallest token's area are left unfilled
+_GRID = 1e-7  # grid for corners, as a share of the square root of the tokens' total area
+_TURN = np.radians(1.0)  # error allowed in a corner's angle; more where its sides are short
 _CONVEX = np.radians(179.0)
-_GROWN = 1.5  # tolerances that a token may reach out of what is left
+_GROWN = 1.5  # tolerances by which a token may reach out of the rest
 
 
 class Laid(NamedTuple):
-    """A token of a shape, by its number, on one side, in its place: pose (3,) is x, y and angle."""
+    """A laid token: number of its shape, whether turned over, and pose (3,): x, y and angle."""
 
     shape: int
     flipped: bool
@@ -41,14 +41,14 @@ class Laid(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A token in its place, and what comes of it.
+    """A possible place of a token, and the state of the search after it is laid there.
 
     Attributes:
         laid: the token.
-        rest: what is left to fill.
-        left: how many tokens are left of each shape.
-        filled: whether all is filled, and no token left.
-        dead: whether what is left has parts of which no tokens have the areas.
+        rest: the area that is left to fill.
+        left: number of tokens left of each shape.
+        filled: whether all is filled and no token is left.
+        dead: whether the tokens left cannot match the areas of the parts of the rest.
     """
 
     laid: Laid
@@ -60,12 +60,12 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Dissection:
-    """K tokens that fill an outline, or some of them that could be laid.
+    """Poses of K tokens that fill an outline, or of those that could be laid.
 
     Attributes:
         poses: (K, 3) x, y and angle.
-        flipped: (K,) which lie on their other side.
-        lies: (K,) which were laid; None is all.
+        flipped: (K,) which tokens are turned over.
+        lies: (K,) which tokens were laid; None: all.
     """
 
     poses: Floats
@@ -74,7 +74,7 @@ class Dissection:
 
     @property
     def laid(self) -> Ints:
-        """Numbers of the tokens that were laid."""
+        """Indices of the tokens that were laid."""
         every = np.arange(len(self.poses))
         return every if self.lies is None else every[self.lies]
 
@@ -85,12 +85,12 @@ class Corner:
 
     Attributes:
         shape: number among the different shapes.
-        flipped: the side.
-        angle: inside of it.
-        leaving, coming: lengths of its edges.
+        flipped: whether the shape is turned over.
+        angle: interior angle, radians.
+        leaving, coming: lengths of the edges after and before the corner.
         body: (C,) all corners, this one at 0 and the next one on the positive x axis.
         place: this corner in the body frame.
-        along: the direction of the edge that leaves it there.
+        along: direction of the edge after the corner, in the body frame.
     """
 
     shape: int
@@ -105,10 +105,12 @@ class Corner:
 
 @dataclass
 class Budget:
-    """What a search may cost, and what it did, in steps.
+    """Limits of a search, and its steps so far.
 
     Attributes:
-        until: when it ends, see `time.thread_time`.
+        until: end time, as `time.thread_time` tells it.
+        nodes: largest number of steps.
+        taken: steps so far.
     """
 
     until: float
@@ -116,23 +118,23 @@ class Budget:
     taken: int = 0
 
     def spent(self) -> bool:
-        """Whether the search must end."""
+        """Whether the search has reached a limit."""
         return self.taken >= self.nodes or time.thread_time() > self.until
 
 
 class Tokens:
-    """A layout's tokens as what fills an outline.
+    """A layout's tokens, prepared for the search.
 
     Attributes:
-        own: the tokens of each shape.
-        counts: how many they are.
+        own: indices of the tokens of each shape.
+        counts: number of tokens of each shape.
         areas: (S,) of each shape.
-        unit: the root of all tokens' area, the side of the full square that tans are cut from.
+        unit: square root of the tokens' total area, the side of the full square of the tans.
         corners: the different corners of all shapes, on both sides.
     """
 
     def __init__(self, layout: Layout) -> None:
-        """Find which of them are alike, and their different corners."""
+        """Group equal tokens, and find the different corners."""
         sides = sides_of(layout)
         shapes = {side.shape: side for side in sides}
         self.own = [side.tokens for side in shapes.values()]
@@ -140,7 +142,7 @@ class Tokens:
         self.areas = np.array([side.area for side in shapes.values()])
         self.unit = float(np.sqrt(layout.areas.sum()))
         most = max(len(side.corners) for side in sides)
-        # Large ones first: what is left is then hard to fill, and that is soon seen.
+        # Large shapes first: a wrong choice then fails sooner.
         self.corners = [
             corner
             for side in sorted(sides, key=lambda side: -side.area)
@@ -149,7 +151,7 @@ class Tokens:
 
     @cached_property
     def angles(self) -> Floats:
-        """Angles that corners of tokens make together, up to a straight one."""
+        """All sums of the tokens' corner angles up to pi, sorted."""
         single = sorted({round(corner.angle, 9) for corner in self.corners})
         sums, new = set(single), set(single)
         while new:
@@ -159,28 +161,28 @@ class Tokens:
 
     @cached_property
     def sets(self) -> tuple[Ints, Floats]:
-        """All sets of tokens but the empty one: how many of each shape (N, S), and their areas."""
+        """All non-empty sets of tokens: counts by shape (N, S), and summed areas (N,)."""
         sets = np.array(list(product(*(range(count + 1) for count in self.counts))))[1:]
         return sets, sets @ self.areas
 
 
 class Search:
-    """Fills one outline with all tokens of a set.
+    """Search for ways to fill one outline with all tokens of a set.
 
     Attributes:
-        budget: what it may cost.
-        best: the tokens of greatest area that were laid at a time.
+        budget: limits of the search.
+        best: of all partial fillings so far, the one with the largest area.
     """
 
     def __init__(self, tokens: Tokens, tolerance: float, budget: Budget) -> None:
-        """Allow an outline's sides to be off by a tolerance, in the units of the outline."""
+        """Set up a search; sides may be off by `tolerance`, in the unit of the outline."""
         self._tokens, self._tolerance, self.budget = tokens, tolerance, budget
         self._least = float(tokens.areas.min())
         self.best: list[Laid] = []
         self._most = 0.0
 
     def run(self, outline: Area) -> Iterator[list[Laid]]:
-        """Different ways to fill an outline; there are no others where the budget was enough."""
+        """Yield the different ways to fill an outline: all of them, if the budget is enough."""
         yield from self._fill(valid(outline), self._tokens.counts, [])
 
     def _fill(self, rest: Area, left: tuple[int, ...], laid: list[Laid]) -> Iterator[list[Laid]]:
@@ -203,7 +205,7 @@ class Search:
                 return
 
     def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        """All that may lie at the corner where least may, and what then is left to fill."""
+        """The possible places at the corner with the fewest; empty if nothing can be laid."""
         parts = parts_of(rest, self._least)
         if not parts or not self.fits(rest, left):
             return []
@@ -215,9 +217,9 @@ class Search:
         return places
 
     def fits(self, rest: Area, left: tuple[int, ...]) -> bool:
-        """Whether all tokens that are left have the areas of all parts of what is left to fill.
+        """Whether the tokens left can be divided among the parts of the rest by their areas.
 
-        Without a token left: whether nothing is left to fill.
+        If no token is left: whether the rest is empty.
         """
         return self._divides([part.area for part in parts_of(rest, self._least)], left)
 
@@ -225,7 +227,7 @@ class Search:
         return without(rest, polygon, self._tolerance, self._tokens.unit)
 
     def _divides(self, areas: Sequence[float], left: tuple[int, ...]) -> bool:
-        """Whether tokens that are left have the areas of all parts."""
+        """Whether the tokens left can be divided among parts of these areas."""
         sets, sizes = self._tokens.sets
         if not areas:
             return not any(left)
@@ -240,7 +242,7 @@ class Search:
     def _fewest(
         self, parts: Sequence[Polygon], left: tuple[int, ...]
     ) -> list[tuple[Laid, Polygon]]:
-        """What may lie at the corner where least may; empty where nothing fits somewhere."""
+        """The options at the corner with the fewest; empty if some corner has none."""
         best: list[tuple[Laid, Polygon]] | None = None
         for part in parts:
             for options in self._options(part, left):
@@ -253,19 +255,19 @@ class Search:
     def _options(
         self, part: Polygon, left: tuple[int, ...]
     ) -> Iterator[list[tuple[Laid, Polygon]]]:
-        """For each convex corner of a part the tokens that may lie there."""
+        """For each convex corner of a part, the tokens that may lie there."""
         tried, corners, at = [], [], []
         options: list[list[tuple[Laid, Polygon]]] = []
         for point, along, angle, leaving, coming in convex_corners(part, self._tolerance):
             slack = _TURN + 3.0 * self._tolerance / min(abs(leaving), abs(coming))
             if np.abs(self._tokens.angles - angle).min() > slack:
-                yield []  # no corners of tokens make this one
+                yield []  # no sum of tokens' corners has this angle
                 return
             options.append([])
             for corner in self._tokens.corners:
                 if not left[corner.shape] or corner.angle > angle + slack:
                     continue
-                # A negative length is that of a side that may go on straight inside.
+                # Negative: the side ends at a reflex corner, so a longer edge may pass it.
                 if 0.0 < leaving < corner.leaving - self._tolerance:
                     continue
                 if 0.0 < coming < corner.coming - self._tolerance and corner.angle > angle - slack:
@@ -284,14 +286,14 @@ class Search:
 
 
 def parts_of(rest: Area, least: float) -> list[Polygon]:
-    """The parts of what is left to fill, without dust; the smallest token has the area `least`."""
+    """The parts of the rest, without dust; `least` is the area of the smallest token."""
     return [part for part in polygons(rest) if part.area > _DUST * least]
 
 
 def without(rest: Area, laid: Area, tolerance: float, unit: float) -> Area:
-    """What tokens leave of what was left, without slivers narrower than two tolerances.
+    """The rest without the area of laid tokens, and without slivers narrower than two tolerances.
 
-    The unit is the root of all tokens' area.
+    `unit` is the square root of the tokens' total area.
     """
     return opened(shapely.difference(rest, laid, grid_size=_GRID * unit), tolerance)
 
@@ -299,10 +301,10 @@ def without(rest: Area, laid: Area, tolerance: float, unit: float) -> Area:
 def convex_corners(
     part: Polygon, tolerance: float
 ) -> Iterator[tuple[complex, complex, float, float, float]]:
-    """Each convex corner: its place, the direction of the side that leaves it, and its angle.
+    """Yield each convex corner: point, direction of the side after it, angle, and two lengths.
 
-    Then the lengths of the sides that leave it and come to it, negative where they end at a
-    corner that is not convex.
+    The lengths are those of the sides after and before the corner, negative for a side whose other
+    end is not convex.
     """
     for z, _, _ in rings(part, tolerance):
         ahead, behind = np.roll(z, -1) - z, np.roll(z, 1) - z
@@ -317,12 +319,12 @@ def convex_corners(
 
 
 def less(left: tuple[int, ...], one: Laid) -> tuple[int, ...]:
-    """How many tokens are left of each shape without one."""
+    """The number of tokens left of each shape after one more is laid."""
     return tuple(count - (shape == one.shape) for shape, count in enumerate(left))
 
 
 def dissection(tokens: Tokens, laid: Sequence[Laid]) -> Dissection:
-    """What was found, token by token of the layout; some may not have been laid."""
+    """The laid tokens in the order of the layout; some tokens may be missing."""
     count = sum(tokens.counts)
     poses, flipped = np.zeros((count, 3)), np.zeros(count, np.bool_)
     lies = np.zeros(count, np.bool_)
@@ -334,7 +336,7 @@ def dissection(tokens: Tokens, laid: Sequence[Laid]) -> Dissection:
 
 
 def _corners(side: Side, most: int) -> Iterator[Corner]:
-    """The corners of a shape on one side of which no turn makes another."""
+    """The corners of a side of a shape that no rotation maps onto each other."""
     body: Complex = side.corners @ np.array([1.0, 1j])
     for i in range(side.different):
         leaving, coming = body[(i + 1) % len(body)] - body[i], body[i - 1] - body[i]
@@ -353,7 +355,7 @@ def _corners(side: Side, most: int) -> Iterator[Corner]:
 
 
 def laid_at(corner: Corner, point: complex, along: complex) -> Laid:
-    """A token with a corner at a point, and the edge that leaves it along a direction."""
+    """A token with its corner at a point, and the edge after this corner along a direction."""
     turn = along / corner.along
     place = point - corner.place * turn
     return Laid(corner.shape, corner.flipped, np.array([place.real, place.imag, np.angle(turn)]))

@@ -1,6 +1,6 @@
-"""Exact tans for corners that were drawn by hand, and pieces pushed apart where they overlap.
+"""Fit of exact tans to hand-drawn corners, and separation of pieces that overlap.
 
-All lengths are in units, the side of the full square that the tans are cut from.
+All lengths are in units: the full square that the tans are cut from has side 1.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from tangram_core.arrays import Floats
 from tangram_sim.geometry.shapes import tan
 
-# A piece may be turned over, which only the parallelogram's outline shows.
+# A piece may be turned over, but this changes only the parallelogram.
 VARIANTS = {
     "large_triangle": ("large_triangle",),
     "medium_triangle": ("medium_triangle",),
@@ -21,18 +21,18 @@ VARIANTS = {
 }
 KINDS = tuple(VARIANTS)
 TOUCHING = 1e-9  # units; less is rounding
-CLEARANCE = 1e-5  # units that pieces are left apart which were pushed
-MAX_ROUNDS = 500  # a drawing to a hundredth takes up to 80
+CLEARANCE = 1e-5  # units, gap between pieces after they are pushed apart
+MAX_ROUNDS = 500  # a drawing accurate to 0.01 units takes up to 80
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A tan where a drawn piece lies.
+    """An exact tan fitted to a drawn piece.
 
     Attributes:
-        shape: its name; for a parallelogram the chirality that fits better.
+        shape: name of the tan; for a parallelogram the variant that fits better.
         pose: (3,) x, y (units) and angle (radians).
-        residual: the largest distance of a drawn corner from the tan's (units).
+        residual: largest distance from a drawn corner to the tan's corner (units).
     """
 
     shape: str
@@ -41,14 +41,14 @@ class Fit:
 
 
 def kind_of(name: str) -> str:
-    """The tan that a shape is, on whichever side; the name itself if it is none."""
+    """The kind of tan of a shape, on either side; the name itself if the shape is no tan."""
     return next((kind for kind, names in VARIANTS.items() if name in names), name)
 
 
 def fit_piece(kind: str, corners: Floats) -> Fit:
-    """The rigid motion with the least squared distance of the corners, over all assignments.
+    """The tan with the least squared distance to corners (V, 2), over all poses and assignments.
 
-    The corners (V, 2) of a kind of `VARIANTS` come in any order and direction.
+    `kind` is a key of `VARIANTS`. The corners may have any order and direction.
     """
     fits = [_fit_shape(name, corners) for name in VARIANTS[kind]]
     return min(fits, key=lambda pair: pair[0])[1]
@@ -62,21 +62,21 @@ def _fit_shape(name: str, corners: Floats) -> tuple[float, Fit]:
     angle = np.angle((body.conj() * drawn).sum(axis=1))
     distance = np.abs(drawn - body * np.exp(1j * angle)[:, None])
     squares = (distance**2).sum(axis=1)
-    # A symmetric shape fits in several ways alike: the first, whatever the rounding.
+    # A symmetric shape fits equally well in several ways: take the first, despite rounding.
     best = int(np.flatnonzero(squares <= squares.min() + TOUCHING)[0])
     pose = np.array([*centre, angle[best]])
     return float(squares[best]), Fit(name, pose, float(distance[best].max()))
 
 
 def overlap_depths(outlines: Floats) -> tuple[Floats, Floats]:
-    """How far each piece must move until it no longer overlaps each other piece.
+    """The depth of the overlap of every two pieces, and the direction of the shortest way apart.
 
     Args:
         outlines: (K, C, 2) convex and counter-clockwise, padded by repeating the last corner.
 
     Returns:
-        depth (K, K), not positive for pieces apart, the same both ways; and the shortest way out
-        (K, K, 2): the unit vector along which piece j leaves piece i.
+        depths (K, K), symmetric, not positive for pieces that are apart; and directions (K, K, 2),
+        unit vectors along which piece j leaves piece i on the shortest way.
     """
     edge = np.roll(outlines, -1, axis=1) - outlines
     length = np.linalg.norm(edge, axis=-1, keepdims=True)
@@ -94,8 +94,8 @@ def overlap_depths(outlines: Floats) -> tuple[Floats, Floats]:
 def separate(outlines: Floats) -> Floats | None:
     """Shifts (K, 2) after which no two outlines (K, C, 2) overlap; None if none are found.
 
-    Again and again the two pieces that overlap most are pushed apart, half the way each. Pieces
-    are not turned, and gaps stay as they are.
+    In each round the two pieces with the deepest overlap are pushed apart, half the way each.
+    Pieces are not rotated, and gaps are not closed.
     """
     shifts = np.zeros((len(outlines), 2))
     for _ in range(MAX_ROUNDS):

@@ -2,7 +2,7 @@
 
 All tokens' corners are stacked into one array (V, 2), token after token; the target uses the same
 order. The graph of Sec. IV-A has N = 2V + K nodes: token corners (V), bases (K), target corners
-(V). Nothing of it but the corners and the flags ever travels or is stored.
+(V). Only corners and flags are ever sent or stored; the rest of the graph follows from them.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ MAX_TOKENS = 16
 
 @dataclass(frozen=True)
 class TokensConfig(Settings, section="tokens"):
-    """The pieces of a puzzle."""
+    """Settings of the token set."""
 
     shapes: tuple[Any, ...] = field(
         metadata=declared(
@@ -32,7 +32,7 @@ class TokensConfig(Settings, section="tokens"):
     )
     scale: float = field(
         metadata=declared(
-            "side of the full square that tans are cut from, or factor on a polygon's corners",
+            "side of the full square that tans are cut from, or factor for a polygon's corners",
             low=1.0 / MAX_COORDINATE,
             high=MAX_COORDINATE,
             unit="arena units",
@@ -48,7 +48,7 @@ class TokensConfig(Settings, section="tokens"):
 
 
 def make_layout(config: TokensConfig) -> "Layout":
-    """The layout of a token set; ConfigError if a shape is unknown, or not convex."""
+    """The layout of a token set; ConfigError if a shape is unknown or not convex."""
     return Layout([_shape(entry).scaled(config.scale) for entry in config.shapes])
 
 
@@ -70,13 +70,13 @@ class Layout:
         body: (V, 2) corners of all tokens in their body frames.
         starts: (K + 1,) token k owns the corners starts[k]:starts[k + 1].
         token_of_corner: (V,) index of the owning token.
-        padded_corners: (K, C) the corners of each token, filled up to the C of the largest by
-            repeating the last.
+        padded_corners: (K, C) indices of each token's corners, padded to the C of the largest by
+            repeating the last one.
         areas: (K,) of the tokens, squared arena units.
-        radii: (K,) largest distance of a corner from the token's centre, arena units.
-        symmetries: (K,) turns by a whole part of a circle that map a token onto itself.
-        chiral: (K,) tokens whose mirror image no turn gives: they can lie on either side.
-        base_weights: (K, V) centre of token k as an affine combination of the corners.
+        radii: (K,) largest distance from a token's centre to a corner, arena units.
+        symmetries: (K,) number of rotations within a full turn that map a token onto itself.
+        chiral: (K,) tokens that no rotation maps onto their mirror image: they have two sides.
+        base_weights: (K, V) weights of the corners whose sum is the centre of token k.
         adjacency: (N, N) edges of the graph, E(i, i) = 0.
     """
 
@@ -101,30 +101,30 @@ class Layout:
 
     @property
     def tokens(self) -> int:
-        """K."""
+        """K, the number of tokens."""
         return len(self.shapes)
 
     @property
     def corner_count(self) -> int:
-        """V."""
+        """V, the number of corners of all tokens."""
         return len(self.body)
 
     @property
     def nodes(self) -> int:
-        """N = 2V + K."""
+        """N = 2V + K, the number of nodes of the graph."""
         return 2 * self.corner_count + self.tokens
 
     def corners_of(self, token: int) -> slice:
-        """The corners of one token, as a slice of V."""
+        """The slice of the V corners that belongs to one token."""
         return slice(int(self.starts[token]), int(self.starts[token + 1]))
 
     def corners(self, poses: Floats, flipped: Bools | None = None) -> Floats:
-        """Corners (..., V, 2) of poses (..., K, 3), each x, y and angle in radians.
+        """Corners (..., V, 2) of tokens in poses (..., K, 3).
 
         Args:
-            poses: of the tokens.
-            flipped: (..., K) which lie on their other side: turned over about their body's x axis
-                before the rest; their corners then run clockwise. None: none does.
+            poses: x, y and angle in radians of each token.
+            flipped: (..., K) tokens that are turned over about their body's x axis, before rotation
+                and shift; their corners then run clockwise. None: no token is.
         """
         pose = np.asarray(poses)[..., self.token_of_corner, :]
         cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
@@ -136,27 +136,27 @@ class Layout:
         )
 
     def bases(self, corners: Floats) -> Floats:
-        """Centres of area (..., K, 2) of tokens with the given corners (..., V, 2)."""
+        """Centres of area (..., K, 2) of tokens with corners (..., V, 2)."""
         centres: Floats = self.base_weights @ corners
         return centres
 
     def flipped(self, corners: Floats) -> Bools:
-        """(..., K) which tokens with corners (..., V, 2) lie on their other side.
+        """(..., K) which tokens with corners (..., V, 2) are turned over.
 
-        Only a chiral token can: what any other shows is the same after a turn.
+        Always False for a token that is not chiral: turning it over looks like a rotation.
         """
         if not self.any_chiral:
             return np.zeros((*corners.shape[:-2], self.tokens), dtype=np.bool_)
-        # The side that fits all corners better, whatever their noise.
+        # The side that fits all corners better, so that noise does not decide.
         placed = corners @ (1.0, 1j)
         own = np.add.reduceat(self._centred.conj() * placed, self.starts[:-1], axis=-1)
         other = np.add.reduceat(self._centred * placed, self.starts[:-1], axis=-1)
         return np.asarray((np.abs(other) > np.abs(own)) & self.chiral)
 
     def poses(self, corners: Floats) -> Floats:
-        """Poses (..., K, 3) of corners (..., V, 2): least-squares rotation, angle in (-pi, pi].
+        """Poses (..., K, 3) for corners (..., V, 2): least-squares rotation, angle in (-pi, pi].
 
-        Which side a token lies on is told by `flipped`.
+        The method `flipped` gives the tokens' sides.
         """
         centres = self.bases(corners)
         offset = corners - centres[..., self.token_of_corner, :]
@@ -174,7 +174,7 @@ class Layout:
     def mirrored(self, poses: Floats, flipped: Bools) -> tuple[Floats, Bools]:
         """The mirror image (x, -y) of poses (..., K, 3) and sides (..., K).
 
-        A chiral token changes its side, any other is the same after a turn.
+        A chiral token changes its side; any other token changes its angle only.
         """
         turns = np.array([shape.mirror or 0.0 for shape in self.shapes])
         image = np.asarray(poses) * (1.0, -1.0, -1.0)
@@ -182,15 +182,15 @@ class Layout:
         return image, np.asarray(flipped) ^ self.chiral
 
     def fingerprint(self) -> str:
-        """A short digest of the shapes: two processes with the same one agree on every index."""
+        """A short digest of the shapes: processes with equal digests agree on every index."""
         content = [[s.name, s.symmetry, np.round(s.corners, 9).tolist()] for s in self.shapes]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
     def _base_weights(self) -> Floats:
         """Minimum-norm weights with sum 1 that give the origin from the body corners.
 
-        A rigid motion is affine, so the same weights give the centre of area in every pose, also
-        for polygons whose centre of area is not the mean of the corners.
+        A rigid motion is affine, so the weights give the centre of area in every pose, even where
+        it is not the mean of the corners.
         """
         weights = np.zeros((self.tokens, self.corner_count))
         for k, shape in enumerate(self.shapes):

@@ -1,8 +1,8 @@
 """Exact overlap area of convex polygons and of unions of tokens, vectorised over a batch.
 
-Clipping is Sutherland-Hodgman with padded outputs. It is continuous in its input, so pieces that
-touch or coincide cost nothing but rounding; a library's general intersection may return a whole
-piece for two that only touch.
+Clipping is Sutherland-Hodgman with padded outputs. The result is continuous in the input, so
+touching or equal pieces cause rounding errors only. A general library may return a whole piece as
+the intersection of two that only touch.
 """
 
 import numpy as np
@@ -10,12 +10,12 @@ import numpy as np
 from tangram_core.arrays import AnyArray, Bools, Complex, Floats, Ints
 from tangram_sim.geometry.layout import Layout
 
-# Pairs of pieces that are looked at together: more no longer fit into a core's cache.
+# Pairs of pieces processed together: more do not fit into a core's cache.
 _MAX_PAIRS = 8192
 
 
 def area(polygons: Floats) -> Floats:
-    """Signed areas (B,) of polygons (B, M, 2); repeated corners do no harm."""
+    """Signed areas (B,) of polygons (B, M, 2); corners may repeat."""
     corners = _complex(polygons)
     total: Floats = (corners.conj() * _ahead(corners)).imag.sum(axis=1) / 2.0
     return total
@@ -24,7 +24,7 @@ def area(polygons: Floats) -> Floats:
 def clip(polygons: Floats, clipper: Floats) -> Floats:
     """Intersection of convex polygons (B, M, 2) with convex counter-clockwise ones (B, C, 2).
 
-    Repeated corners, by which polygons of fewer corners are padded, do no harm in either.
+    Both may repeat corners, as padding.
 
     Returns:
         (B, M', 2): corners of the intersection, padded by repeating its first corner to the
@@ -81,11 +81,11 @@ def _interleaved(first: AnyArray, second: AnyArray) -> AnyArray:
 
 
 def overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
-    """Area (B,) of (union of tokens) intersected with (union of targets).
+    """Area (B,) that the union of tokens shares with the union of targets.
 
-    Inclusion and exclusion, one round for each number of tokens that cover the same place: what
-    single tokens cover of the target's pieces, less what two of them do, and so on. Each round
-    clips all pieces of the whole batch at once, and only where both can meet.
+    Computed by inclusion and exclusion: areas of the targets' pieces covered by single tokens,
+    minus those covered by pairs of tokens, plus those by triples, and so on. Each round clips all
+    pieces of the batch at once, and only pairs whose bounding boxes meet.
 
     Args:
         tokens: (B, V, 2) corners of the tokens; tokens may overlap each other.
@@ -109,7 +109,7 @@ def union_area(tokens: Floats, layout: Layout) -> Floats:
     count = layout.tokens
     rows = np.repeat(np.arange(len(tokens)), count)
     own = outlines(tokens, layout)
-    # Each token counts without what those behind it cover of it.
+    # Each token counts without the part that later tokens cover.
     last = np.tile(np.arange(count), len(tokens))
     whole = layout.areas.sum()
     return np.asarray(whole - _covered(own, rows, own.reshape(len(rows), -1, 2), last))
@@ -118,11 +118,11 @@ def union_area(tokens: Floats, layout: Layout) -> Floats:
 def _covered(own: Floats, rows: Ints, pieces: Floats, last: Ints) -> Floats:
     """(B,) summed area of the parts of pieces (P, M, 2) that tokens (B, K, C, 2) cover.
 
-    `rows` (P,) say whose piece it is; only tokens behind `last` (P,) count.
+    `rows` (P,) gives each piece's row of the batch; only tokens after number `last` (P,) count.
     """
     total, sign, count = np.zeros(len(own)), 1.0, own.shape[1]
     for _ in range(count):
-        # Every piece with every token behind the last one that it was cut with.
+        # Every piece with every token after the last one that it was clipped by.
         piece, token = np.nonzero(np.arange(count) > last[:, None])
         meet = _boxes_meet(pieces[piece], own[rows[piece], token])
         piece, token = piece[meet], token[meet]
@@ -138,9 +138,9 @@ def _covered(own: Floats, rows: Ints, pieces: Floats, last: Ints) -> Floats:
 
 
 def outlines(corners: Floats, layout: Layout) -> Floats:
-    """Corners (B, V, 2) token by token, (B, K, C, 2), padded by repeating a token's last one.
+    """Corners (B, V, 2) grouped by token (B, K, C, 2), padded by repeating a token's last one.
 
-    Counter-clockwise, whichever side a token lies on.
+    Outlines are counter-clockwise on both sides of a token.
     """
     padded: Floats = corners[:, layout.padded_corners]
     if layout.any_chiral:
@@ -150,7 +150,7 @@ def outlines(corners: Floats, layout: Layout) -> Floats:
 
 
 def _boxes_meet(first: Floats, second: Floats) -> Bools:
-    """(B,), whether the bounding boxes of polygons (B, M, 2) and (B, C, 2) overlap."""
+    """(B,) whether the bounding boxes of polygons (B, M, 2) and (B, C, 2) overlap."""
     low, high = _box(first)
     other_low, other_high = _box(second)
     apart = (low >= other_high) | (other_low >= high)
@@ -165,21 +165,21 @@ def _box(polygons: Floats) -> tuple[Floats, Floats]:
 
 
 def covered_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
-    """Raw overlap in [0, 1], (B,): the covered share of the target's area."""
+    """Raw overlap (B,) in [0, 1]: the covered share of the target's area."""
     whole = layout.areas.sum()
     share: Floats = np.clip(overlap_area(tokens, targets, layout) / whole, 0.0, 1.0)
     return share
 
 
 def pairs_overlap(first: Floats, second: Floats, tolerance: float = 1e-9) -> Bools:
-    """(B,), whether polygons (B, M, 2) and (B, C, 2) overlap by more than `tolerance` in area."""
+    """(B,) whether polygons (B, M, 2) and (B, C, 2) overlap by more than `tolerance` in area."""
     return np.asarray(shared_area(first, second) > tolerance)
 
 
 def shared_area(first: Floats, second: Floats) -> Floats:
     """(B,) area that convex counter-clockwise polygons (B, M, 2) and (B, C, 2) share."""
     shared = np.zeros(len(first))
-    # Most pairs are too far apart to meet: only the rest is worth clipping.
+    # Most pairs are too far apart to meet: clip only the others.
     rows = np.flatnonzero(_boxes_meet(first, second))
     if len(rows):
         shared[rows] = area(clip(first[rows], second[rows]))
@@ -201,9 +201,9 @@ def outlines_at(body: Floats, poses: Floats, flipped: Bools) -> Floats:
     """Counter-clockwise corners (M, C, 2) of single tokens in poses (M, 3).
 
     Args:
-        body: (C, 2) corners of the one token, or (M, C, 2) of each.
+        body: (C, 2) corners of one token for all poses, or (M, C, 2) of one for each.
         poses: x, y and angle of each.
-        flipped: (M,) which lie on their other side, see `Layout.corners`.
+        flipped: (M,) tokens that are turned over, see `Layout.corners`.
     """
     cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = body[..., 0], body[..., 1]

@@ -1,11 +1,11 @@
-"""Convex polygons as bodies of the engine: prisms, polygons moved inwards, and their thickness."""
+"""Convex polygons as bodies of the engine: prisms, inset polygons and thickness."""
 
 import numpy as np
 
 from tangram_core.arrays import Floats
 from tangram_sim.geometry.shapes import polygon_area
 
-ENGINE_ARENA = 2.0  # width of the arena as the engine sees it, whatever its unit
+ENGINE_ARENA = 2.0  # width of the arena in engine units
 
 
 def prism(corners: Floats, half_height: float) -> tuple[list[list[float]], list[int]]:
@@ -25,7 +25,7 @@ def prism(corners: Floats, half_height: float) -> tuple[list[list[float]], list[
 def inset(corners: Floats, depth: float) -> Floats:
     """A convex counter-clockwise polygon (V, 2) with every edge moved inwards by `depth`.
 
-    Right for depths that leave every edge some length, such as a small part of the thickness.
+    Valid if every edge keeps a positive length, as for a small part of the thickness.
     """
     edge = np.roll(corners, -1, axis=0) - corners
     inwards = np.stack([-edge[:, 1], edge[:, 0]], axis=1)
@@ -37,10 +37,10 @@ def inset(corners: Floats, depth: float) -> Floats:
 
 
 def thickness(corners: Floats) -> float:
-    """Twice area by perimeter of a convex polygon (V, 2).
+    """Twice the area divided by the perimeter of a convex polygon (V, 2).
 
-    The radius of the largest circle inside where that touches every edge, as in all triangles and
-    squares, and less than its diameter in every polygon.
+    This is the radius of the largest inner circle if the circle touches every edge, as in all
+    triangles and squares. In every polygon it is less than the circle's diameter.
     """
     edge = np.roll(corners, -1, axis=0) - corners
     return float(2.0 * polygon_area(corners) / np.linalg.norm(edge, axis=1).sum())

@@ -1,7 +1,7 @@
-"""A target without its pieces: the outline of what they cover, as rows of corners that travel.
+"""Outlines of targets as rows of corners: conversion from areas, and back.
 
-Ring after ring, each closed by its first corner; rows that are left over repeat the last one. A
-ring within another is a hole. Legend: V corners of all tokens, K tokens, G rows.
+Rows hold ring after ring, each closed by its first corner. Unused rows repeat the last one. A ring
+within another is a hole. Legend: V corners of all tokens, K tokens, G rows.
 """
 
 from functools import reduce
@@ -16,15 +16,16 @@ from tangram_sim.geometry.areas import Area, grown, rings, valid
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines
 
-_SEAM = 0.002  # of the root of all tokens' area: half of the gaps between pieces that are closed
-_STRAIGHT = 0.002  # of it: corners that are less off a straight side are none
-_GRID = 1e-7  # of it, to which corners are rounded
+# All as shares of the square root of the tokens' total area.
+_SEAM = 0.002  # half the width of the widest gap between pieces that is closed
+_STRAIGHT = 0.002  # corners nearer to a straight side are left out
+_GRID = 1e-7  # grid for corners
 
 
 def covered_area(corners: Floats, layout: Layout, tokens: Bools | None = None) -> Area:
-    """What tokens with corners (V, 2) cover together, gaps closed.
+    """The area that tokens with corners (V, 2) cover together, with narrow gaps closed.
 
-    `tokens` (K,) are those that count; None: all do.
+    `tokens` (K,) marks the tokens that count; None: all.
     """
     pieces = outlines(np.asarray(corners, np.float64)[None], layout)[0]
     counted = pieces if tokens is None else pieces[tokens]
@@ -35,26 +36,26 @@ def covered_area(corners: Floats, layout: Layout, tokens: Bools | None = None) -
 
 
 def unit_of(layout: Layout) -> float:
-    """The root of all tokens' area, the side of the full square that tans are cut from."""
+    """Square root of the tokens' total area: the side of the full square of the tans."""
     return float(np.sqrt(layout.areas.sum()))
 
 
 def as_rows(area: Area, layout: Layout, most: int) -> Floats:
-    """Corners (G, 2) of an area's rings, `most` of them; ConfigError if it has too many."""
-    # Where rings begin is not to tell of the pieces.
+    """Corners of an area's rings as rows (`most`, 2); ConfigError if there are too many."""
+    # Normalised: the first corner of a ring must not give away the pieces.
     every = [z for z, _, _ in rings(shapely.normalize(area), _STRAIGHT * unit_of(layout))]
     joined = np.concatenate([np.append(z, z[0]) for z in every]) if every else np.zeros(1, complex)
     if len(joined) > most:
         raise ConfigError(
-            f"an outline of these tokens has at most {most} corners, one for each ring counted "
-            f"twice, got {len(joined)}: draw straight sides"
+            f"an outline of these tokens has at most {most} corners, counting the first corner of "
+            f"each ring twice, got {len(joined)}: draw straight sides"
         )
     joined = np.append(joined, np.full(most - len(joined), joined[-1]))
     return np.column_stack([joined.real, joined.imag])
 
 
 def as_area(rows: AnyArray) -> Area:
-    """The area of rows (G, 2), whatever they hold; empty where they enclose nothing."""
+    """The area that rows (G, 2) of any numbers enclose; empty if they enclose none."""
     found, first, points = [], 0, np.asarray(rows, np.float64)
     while first < len(points):
         closed = np.flatnonzero((points[first + 1 :] == points[first]).all(axis=1))

@@ -23,9 +23,9 @@ class Shape:
     """A convex polygon in its body frame.
 
     Attributes:
-        name: what the user calls it.
+        name: as the user gives it.
         corners: (V, 2), counter-clockwise, centre of area at the origin.
-        symmetry: the number of rotations in [0, 2*pi) that map the polygon onto itself.
+        symmetry: number of rotations in [0, 2*pi) that map the polygon onto itself.
     """
 
     name: str
@@ -44,9 +44,9 @@ class Shape:
 
     @cached_property
     def mirror(self) -> float | None:
-        """The angle by which the mirror image (x, -y) is the shape itself turned; None if none.
+        """The angle that rotates the shape onto its mirror image (x, -y); None if none does.
 
-        A shape without one is chiral: no turn in the plane gives its mirror image.
+        A shape without such an angle is chiral.
         """
         return turn_onto(self.corners, mirror_image(self.corners))
 
@@ -70,13 +70,13 @@ def polygon_centroid(corners: Floats) -> Floats:
 
 
 def mirror_image(corners: Floats) -> Floats:
-    """Counter-clockwise corners (V, 2) of the mirror image (x, -y) of such corners."""
+    """The mirror image (x, -y) of corners (V, 2); both are counter-clockwise."""
     image: Floats = corners[::-1] * (1.0, -1.0)
     return image
 
 
 def turn_onto(corners: Floats, image: Floats) -> float | None:
-    """The angle by which corners (V, 2) must be turned to be the image (V, 2); None if none does.
+    """The angle that rotates corners (V, 2) onto an image (V, 2); None if none does.
 
     Both are counter-clockwise around the origin, and may begin with different corners.
     """
@@ -86,14 +86,14 @@ def turn_onto(corners: Floats, image: Floats) -> float | None:
     for shift in range(len(body)):
         rolled = np.roll(wanted, shift)
         turn = rolled[0] / body[0]
-        turn /= abs(turn)  # a turn only: a similar shape of another size is not it
+        turn /= abs(turn)  # a rotation only: a shape of another size is not equal
         if np.allclose(rolled, turn * body, rtol=0.0, atol=1e-6 * np.abs(body).max()):
             return float(np.angle(turn))
     return None
 
 
 def polygon(name: str, corners: Sequence[Sequence[float]]) -> Shape:
-    """A user's shape of 3 to 16 corners, in either direction; ConfigError if it is not convex."""
+    """A user's shape of 3 to 16 corners, in either direction; ConfigError unless convex."""
     points = _checked_points(name, corners)
     if polygon_area(points) < 0:
         points = points[::-1]
@@ -133,7 +133,7 @@ def _check_convex(name: str, points: Floats) -> None:
 
 
 def _symmetry_order(points: Floats) -> int:
-    """The largest k for which a turn by 2*pi/k maps the corners onto themselves."""
+    """The largest k for which a rotation by 2*pi/k maps the corners onto themselves."""
     count = len(points)
     as_complex = points[:, 0] + 1j * points[:, 1]
     orders = (k for k in range(count, 1, -1) if count % k == 0)
@@ -159,7 +159,7 @@ SHAPE_NAMES = tuple(_TANS)
 
 
 def tan(name: str) -> Shape:
-    """One of the tans by name, for a full square of side 1; ConfigError if there is none."""
+    """A tan by name, cut from a full square of side 1; ConfigError for an unknown name."""
     if name not in _TANS:
         raise ConfigError(
             f"unknown shape '{name}': choose from {', '.join(SHAPE_NAMES)}, "

@@ -1,4 +1,4 @@
-"""The different shapes of a layout, each on the sides that no turn makes from the other."""
+"""The different shapes of a layout, a chiral shape once for each of its sides."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,11 +16,11 @@ class Side:
 
     Attributes:
         shape: number among the different shapes of a layout.
-        flipped: whether it is the other side of a chiral shape.
+        flipped: whether a chiral shape is turned over.
         corners: (C, 2) counter-clockwise.
-        different: corners of which no turn makes another.
+        different: number of corners that no rotation of the shape maps onto each other.
         area: of the shape.
-        tokens: those of the layout that have this shape.
+        tokens: indices of the layout's tokens with this shape.
     """
 
     shape: int
@@ -33,7 +33,7 @@ class Side:
 
 @lru_cache(maxsize=8)
 def sides_of(layout: Layout) -> tuple[Side, ...]:
-    """All different shapes of a layout, chiral ones on both sides."""
+    """All different shapes of a layout; chiral ones appear on both sides."""
     found: list[tuple[Shape, list[int]]] = []
     for token, shape in enumerate(layout.shapes):
         alike = (tokens for one, tokens in found if _same(one, shape))

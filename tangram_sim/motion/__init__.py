@@ -1,4 +1,4 @@
-"""What an action means, and where it takes a token without an engine.
+"""Meaning of actions, and exact motion of tokens without an engine.
 
 Start with `actions.py`. May import tangram_sim.geometry and tangram_sim.sight.
 """

@@ -1,4 +1,4 @@
-"""What the numbers of an action mean, and how many of them an episode has.
+"""Encoding of actions, their number in an episode, and bounds of the motion.
 
 Legend: B actions of A entries each, K tokens.
 """
@@ -14,7 +14,7 @@ _ROUNDING = 1.0 + 1e-6
 
 
 def action_size(tokens: int, sim: SimConfig) -> int:
-    """A, the entries of an action: which token (if several), whether to flip it, 3 velocities."""
+    """A, the size of an action: the token (if several), the flip (if allowed), 3 velocities."""
     return 3 + (tokens > 1) + sim.allow_flip
 
 
@@ -24,18 +24,17 @@ def horizon(tokens: int, sim: SimConfig) -> int:
 
 
 def full_scale(sim: SimConfig) -> Floats:
-    """(3,) what an entry of 1 moves in a second: the arena's width in x and in y, half a turn."""
+    """(3,) the velocity for an entry of 1: the arena's width in x and y, half a turn (rad)."""
     return np.array([sim.arena, sim.arena, np.pi])
 
 
 def corner_bound(tokens: int, sim: SimConfig) -> float:
     """The largest |coordinate| that a corner can reach in an episode, arena units.
 
-    A start lies inside the arena, or its middle does, and each action moves a token in x and in y
-    by at most the arena's width; turning keeps a corner within the start's margin for every angle.
-    One that settles moves others by less, wherever it was set down.
-    Pictures show a token with its middle in them, wherever the camera stands, and while they show
-    nothing of it, it is taken to lie where it was told to go.
+    A token starts inside the arena at every angle, or, with `sim.overhang`, with its centre inside.
+    Each action moves it in x and y by at most the arena's width. Tokens that are pushed apart move
+    by less than one more width. With pictures, only the centre of a found token is sure to lie in
+    the arena. A missing token is assumed to have moved as commanded.
     """
     inside = 1.0 if sim.looks or sim.overhang else 0.5
     moved = sim.actions_per_token + (tokens > 1)
@@ -43,9 +42,9 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
 
 
 def goal_rows(layout: Layout, sim: SimConfig) -> int:
-    """G, the corners of a target as agents see it: its pieces', or rows of their outline.
+    """G, the rows of a target as agents see it: corners of its pieces, or of their outline.
 
-    An outline has no more corners than its pieces, and each ring one row more, see `rings`.
+    An outline has at most as many corners as its pieces, and one more row per ring, see `rings`.
     """
     if sim.observe != SILHOUETTE:
         return layout.corner_count
@@ -53,7 +52,7 @@ def goal_rows(layout: Layout, sim: SimConfig) -> int:
 
 
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:
-    """(B,) the token that each action (B, A) moves: the first entry cuts [-1, 1] into K parts."""
+    """(B,) the token that each action (B, A) names by its first entry: [-1, 1] in K equal parts."""
     if tokens == 1:
         return np.zeros(len(actions), dtype=np.int64)
     share = (np.asarray(actions)[:, 0] + 1.0) / 2.0
@@ -61,9 +60,9 @@ def chosen_tokens(actions: Floats, tokens: int) -> Ints:
 
 
 def velocities(actions: Floats, sim: SimConfig) -> Floats:
-    """(B, 3) of actions (B, A): full scale crosses the arena and makes half a turn in a second.
+    """Velocities (B, 3) of actions (B, A), in arena units and radians per second.
 
-    So one action can reach every pose of the arena from every other.
+    At full scale one action crosses the arena and makes half a turn, so it can reach every pose.
     """
     scaled: Floats = np.asarray(actions, dtype=np.float64)[:, -3:] * full_scale(sim)
     return scaled
@@ -72,7 +71,7 @@ def velocities(actions: Floats, sim: SimConfig) -> Floats:
 def flips(actions: Floats, layout: Layout, sim: SimConfig) -> Bools:
     """(B,) which actions (B, A) turn their token over: the entry before the velocities is > 0.
 
-    A token whose mirror image is the token itself, turned, has one side only and never flips.
+    A token that is not chiral never flips: turning it over looks like a rotation.
     """
     if not sim.allow_flip:
         return np.zeros(len(actions), dtype=np.bool_)
@@ -81,9 +80,10 @@ def flips(actions: Floats, layout: Layout, sim: SimConfig) -> Bools:
 
 
 def velocities_of(ways: Floats, sim: SimConfig) -> Floats:
-    """Velocities (B, 3) that make shifts and turns (B, 3), arena units and radians, the short way.
+    """Entries (B, 3) of actions for shifts and rotations (B, 3), arena units and radians.
 
-    The inverse of `velocities`; a shift beyond the arena's width gives entries beyond [-1, 1].
+    The inverse of `velocities`, with the shorter way round. A shift beyond the arena's width gives
+    entries beyond [-1, 1].
     """
     shortest = np.column_stack([ways[:, :2], wrap(ways[:, 2])])
     velocity: Floats = shortest / full_scale(sim)
@@ -96,11 +96,11 @@ def make_actions(
     """Actions (B, A) as `chosen_tokens`, `velocities` and `flips` read them.
 
     Args:
-        token: (B,) which one moves; of account where there are several.
+        token: (B,) number of the token that moves; ignored if there is only one.
         velocity: (B, 3) in [-1, 1].
-        flip: (B,) whether it is turned over; of account with `sim.allow_flip`.
+        flip: (B,) whether the token is turned over; ignored without `sim.allow_flip`.
         tokens: K.
-        sim: says whether tokens can be turned over.
+        sim: settings of the world, for `sim.allow_flip`.
     """
     parts: list[Floats | Singles] = []
     if tokens > 1:

@@ -1,4 +1,4 @@
-"""The exact rigid motion without an engine: for tests, oracles and machines without pybullet."""
+"""Exact rigid motion without an engine, for tests, oracles and machines without PyBullet."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from tangram_sim.sight.pictures import photograph
 
 
 class KinematicWorld:
-    """Tokens that go exactly where they are told, lifted, without contacts; see `World`."""
+    """A world where tokens move exactly as commanded, without contacts; see `World`."""
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
         self._layout = layout
@@ -47,6 +47,6 @@ class KinematicWorld:
 
 
 def wrap(angle: Floats) -> Floats:
-    """The same angle in (-pi, pi]."""
+    """An angle (radians) wrapped to (-pi, pi]."""
     wrapped: Floats = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
     return wrapped

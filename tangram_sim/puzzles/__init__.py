@@ -1,4 +1,4 @@
-"""Figures of the seven tans that people know: read without trust, fitted to exact tans, checked.
+"""Figures of the seven tans: untrusted files are read, checked and fitted to exact tans.
 
 Start with `figures.py`; the JSON files are the library. May import tangram_sim.geometry.
 """

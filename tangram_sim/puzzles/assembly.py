@@ -1,6 +1,6 @@
-"""From a drawn figure to exact tans: fitted, checked, and pushed apart where they overlap a little.
+"""From a drawn figure to exact tans: pieces are fitted, checked, and pushed apart if they overlap.
 
-Gaps stay as they are drawn: closing them would need to know which edges are meant to touch.
+Gaps stay as drawn: the drawing does not say which edges should touch.
 """
 
 from collections import Counter
@@ -25,24 +25,24 @@ COUNTS = {
     "square": 1,
     "parallelogram": 1,
 }
-# Units. Coordinates to a hundredth move a corner by up to 0.014 and a fit leaves less.
+# Units. Errors of 0.01 in x and y move a corner by up to 0.014, and a fit leaves less.
 MAX_RESIDUAL = 0.03
-# Two neighbours move by twice that, and turn. How deep and not how large: an overlap along a whole
-# edge has a larger area than one at a corner, but comes from the same error of the drawing: 0.014
-# along its longest edge is 11 % of a small triangle.
+# Units. Both neighbours move by as much, and rotate. The limit is a depth and not an area: for the
+# same error of the drawing, an overlap along a whole edge has a larger area than one at a corner.
+# A depth of 0.014 along its longest edge is 11 % of a small triangle.
 MAX_DEPTH = 0.04
-MAX_PUSH = 0.1  # that a piece may be pushed in all
+MAX_PUSH = 0.1  # units, by which a piece may be pushed in all
 
 
 @dataclass(frozen=True)
 class PuzzleRules:
-    """What a figure must be, and how large it gets.
+    """Rules that a figure must keep, and its scale.
 
     Attributes:
-        scale: side of the full square in arena units, that of the token set.
-        subset: allow figures of some of the seven tans.
-        max_extent: largest distance of two corners, in units; with it a figure of scale 0.6 fits
-            into an arena of width 2 however it is turned.
+        scale: side of the full square in arena units, as in the token set.
+        subset: whether a figure may have only some of the seven tans.
+        max_extent: largest distance between two corners, in units. With the default, a figure of
+            scale 0.6 fits into an arena of width 2 at every angle.
     """
 
     scale: float = 0.6
@@ -56,10 +56,10 @@ class PuzzleRules:
 
 @dataclass(frozen=True, eq=False)
 class Puzzle:
-    """A figure of K tans, its bounding box's middle at the origin.
+    """A figure of K tans, with the middle of its bounding box at the origin.
 
     Attributes:
-        name: what people call it.
+        name: of the figure.
         pieces: K names of tans, in the order of `SHAPE_NAMES`.
         poses: (K, 3) x, y (arena units) and angle (radians).
         scale: side of the full square, in arena units.
@@ -72,7 +72,7 @@ class Puzzle:
 
     @cached_property
     def layout(self) -> Layout:
-        """Its tans as a token set."""
+        """The tans of the figure as a token set."""
         return make_layout(TokensConfig(self.pieces, self.scale))
 
     @property
@@ -82,7 +82,7 @@ class Puzzle:
 
 
 def build_puzzle(sketch: Sketch, rules: PuzzleRules) -> tuple[Puzzle | None, list[str]]:
-    """The exact figure of a drawing, or its faults."""
+    """The exact figure of a drawing and no faults, or None and the faults."""
     where = f"puzzle '{sketch.name}'"
     fits = [fit_piece(kind, corners) for kind, corners in sketch.pieces]
     faults = _count_faults(sketch, rules, where) + _fit_faults(sketch, fits, where)
@@ -116,7 +116,7 @@ def _centred(
     names = [shape.name for shape in layout.shapes]
     order = sorted(range(len(names)), key=lambda k: SHAPE_NAMES.index(names[k]))
     poses = poses[order] * (rules.scale, rules.scale, 1.0)
-    poses.setflags(write=False)  # the library's are shared
+    poses.setflags(write=False)  # the cached library shares them
     return Puzzle(name, tuple(names[k] for k in order), poses, rules.scale), []
 
 

@@ -1,8 +1,7 @@
-"""Puzzles that people know: figures of the seven tans, from files and from the package's library.
+"""Puzzles: figures of the seven tans, from files and from the package's library.
 
-A file is JSON (see `sketches`) and drawn by hand to about a hundredth of a unit.
-Each piece becomes the exact tan that fits best. Pieces that overlap a little are pushed apart; gaps
-stay as they are drawn.
+A file is JSON (see `sketches`), drawn by hand to about a hundredth of a unit. Each piece becomes
+the exact tan that fits best. Pieces that overlap a little are pushed apart; gaps stay as drawn.
 """
 
 from collections.abc import Sequence
@@ -17,26 +16,26 @@ from tangram_sim.puzzles.sketches import Sketch, parse_sketches, read_text
 
 PACKAGED: Traversable = files("tangram_sim") / "puzzles"
 SPLITS = ("train", "test", "paper")
-_MAX_TOLD = 20  # faults in one message
+_MAX_TOLD = 20  # most faults in one message
 
 
 def read_puzzles(path: Path, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
-    """The puzzles of a JSON file; by default of all tans.
+    """The puzzles of a JSON file; by default each must have all seven tans.
 
     Raises:
-        ConfigError: the file cannot be used, or has faults; all of them are named.
+        ConfigError: the file cannot be used, or has faults; the message lists the faults.
     """
     if path.suffix.lower() == ".svg":
         raise ConfigError(
-            f"puzzle={path} is a drawing, which tells no pieces: tangram-play silhouette={path} "
-            "fills it, or write the pieces into a JSON file"
+            f"puzzle={path} is a drawing, which does not name its pieces: fill it with "
+            f"tangram-play silhouette={path}, or write the pieces into a JSON file"
         )
     text = read_text(path)
     return parse_puzzles(text, f"puzzle file {path.name}", rules)
 
 
 def parse_puzzles(text: str, source: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
-    """The puzzles of a JSON text, which errors call `source`; see `read_puzzles`."""
+    """The puzzles of a JSON text; `source` is its name in errors. See `read_puzzles`."""
     return _built(parse_sketches(text, source), rules or PuzzleRules())
 
 
@@ -56,7 +55,7 @@ def _built(sketches: Sequence[Sketch | list[str]], rules: PuzzleRules) -> tuple[
 
 
 def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
-    """A puzzle of the package; ConfigError if there is none of this name."""
+    """A puzzle of the package by name; ConfigError for an unknown name."""
     found = {puzzle.name: puzzle for puzzle in library(None, scale)}
     if name not in found:
         raise ConfigError(f"unknown puzzle '{name}': choose from {', '.join(found)}")
@@ -65,12 +64,13 @@ def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
 
 @lru_cache(maxsize=16)
 def library(split: str | None = None, scale: float = 0.6) -> tuple[Puzzle, ...]:
-    """The package's puzzles: train and test have all seven tans, paper has the paper's own.
+    """The package's puzzles of one split, or of all splits.
 
-    The scale is the side of the full square, in arena units.
+    Figures of train and test have all seven tans; paper has the figures of the paper. The scale is
+    the side of the full square, in arena units.
 
     Raises:
-        ConfigError: an unknown split.
+        ConfigError: the split is unknown.
     """
     if split is None:
         return tuple(puzzle for one in SPLITS for puzzle in library(one, scale))

@@ -1,8 +1,8 @@
-"""Puzzle files as people draw them, read without trust.
+"""Reading of hand-drawn puzzle files, whose content is not trusted.
 
 A file is JSON: {"format": "tangram-puzzles", "version": 1, "puzzles": [{"name": "cat", "pieces":
 [{"shape": "square", "corners": [[x, y], ...]}, ...]}, ...]}. Lengths are in units, the side of the
-full square that the tans are cut from; corners come in any order, anywhere in the plane.
+full square that the tans are cut from. Corners may have any order, anywhere in the plane.
 """
 
 import json
@@ -22,7 +22,7 @@ MAX_BYTES = 4 * 2**20
 MAX_PUZZLES = 1000
 MAX_NAME = 64
 MAX_PIECES = 16
-_MAX_SHOWN = 60  # characters of a wrong value in a message
+_MAX_SHOWN = 60  # most characters of a wrong value in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +39,11 @@ class Sketch:
 
 
 class FaultError(Exception):
-    """What is wrong with one puzzle; its text says where."""
+    """A fault of one puzzle; the text says where it is."""
 
 
 def check_file(path: Path, source: str) -> None:
-    """Raise ConfigError unless a path leads to a file; `source` is what the error calls it."""
+    """Raise ConfigError unless a path leads to a file; `source` is its name in the error."""
     try:
         there, why = path.is_file(), ""
     except OSError as error:  # a name that is too long, or a folder that may not be read
@@ -53,7 +53,7 @@ def check_file(path: Path, source: str) -> None:
 
 
 def read_text(path: Path, source: str | None = None) -> str:
-    """The text of a drawing; ConfigError if it cannot be read, is too large, or no UTF-8."""
+    """The text of a drawing; ConfigError if it is unreadable, too large or not UTF-8."""
     source = source or f"puzzle file {path}"
     check_file(path, source)
     try:
@@ -72,10 +72,10 @@ def read_text(path: Path, source: str | None = None) -> str:
 
 
 def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
-    """The puzzles of a JSON text in its order; for a puzzle that cannot be used, its faults.
+    """The puzzles of a JSON text in its order, or a list of faults for an unusable puzzle.
 
     Raises:
-        ConfigError: nothing of the file, which errors call `source`, can be used.
+        ConfigError: the whole text is unusable; `source` is its name in errors.
     """
     content = loaded(text, source)
     if not isinstance(content, dict) or set(content) != {"format", "version", "puzzles"}:
@@ -88,7 +88,7 @@ def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
 
 
 def loaded(text: str, source: str) -> Any:
-    """What a JSON text holds, no key given twice; ConfigError if it is too long, or no JSON."""
+    """The content of a JSON text; ConfigError if it is too long, no JSON, or repeats a key."""
     if len(text) > MAX_BYTES:
         raise ConfigError(f"{source} is longer than {MAX_BYTES} characters: split it")
     try:
@@ -105,7 +105,7 @@ def loaded(text: str, source: str) -> Any:
 
 
 def check_format(content: dict[str, Any], name: str, version: int, source: str) -> None:
-    """Raise ConfigError unless a file is of a format and version."""
+    """Raise ConfigError unless a file has the given format and version."""
     if content["format"] != name:
         raise ConfigError(f"{source}: format must be '{name}', got {shown(content['format'])}")
     if type(content["version"]) is not int or content["version"] != version:
@@ -154,7 +154,7 @@ def _sketches(entries: list[Any]) -> list[Sketch | list[str]]:
 
 
 def checked_name(name: Any, where: str) -> str:
-    """A puzzle's name; FaultError if it is empty, too long, or cannot be printed."""
+    """A puzzle's name, checked; FaultError if it is empty, too long or not printable."""
     if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME or not name.isprintable():
         raise FaultError(
             f"{where}: name must be 1 to {MAX_NAME} printable characters, got {shown(name)}"
@@ -189,7 +189,7 @@ def _piece(entry: Any, where: str) -> tuple[str, Floats]:
 
 
 def drawn_point(corner: Any, where: str) -> tuple[float, float]:
-    """A corner; FaultError if it is no pair of finite numbers, or too large."""
+    """A corner (x, y), checked; FaultError unless it is a pair of numbers within bounds."""
     if not isinstance(corner, list) or len(corner) != 2 or not all(map(is_number, corner)):
         raise FaultError(
             f"{where}: a corner must be [x, y], finite and within +-{MAX_COORDINATE:g}, "
@@ -205,7 +205,7 @@ def is_number(value: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """A wrong value, short enough for a message."""
+    """A wrong value as a text that is short enough for a message."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # too many digits, or too deep

@@ -1,9 +1,9 @@
-"""What an agent sees where pictures are its only source: tokens as they were found, and which not.
+"""Perception from pictures alone: which tokens were found and where, and which are missing.
 
-What is found has no name: of tokens that look alike, each is taken for the one that lay nearest
-when the agent looked last. So an agent's tokens need not be the world's, see `Sight.hands`. Nor is
-it seen how far a token turned that looks alike after a part of a turn: it is taken to have turned
-about as it was told.
+A picture has no names. Among equal tokens, a found one is taken for the token that was nearest to
+its place in the picture before. So an agent's indices of tokens can differ from the world's, see
+`Sight.hands`. A symmetric token looks the same at several angles. Of these the one nearest to the
+commanded rotation is taken.
 
 Legend: B environments, K tokens, V corners, P pixels along a side of a picture.
 """
@@ -16,18 +16,18 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Ints, Pixels
 from tangram_sim.geometry.layout import Layout
 
-_STILL = 0.03  # radians, and share of a token's radius, up to which nothing moved
+_STILL = 0.03  # smaller motions count as none: radians, and share of a token's radius
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What one picture shows.
+    """Tokens found in one picture.
 
     Attributes:
-        poses: (K, 3) x, y and angle of the tokens, alike ones in any order.
-        flipped: (K,) which lie on their other side.
-        known: (K,) which lie there, or could lie otherwise as well; poses of others say nothing.
-        sure: (K,) those of them that surely lie there.
+        poses: (K, 3) x, y and angle of the tokens; equal tokens have any order.
+        flipped: (K,) tokens that are turned over.
+        known: (K,) tokens with a possible pose; the poses of the others mean nothing.
+        sure: (K,) known tokens that can have no other pose.
     """
 
     poses: Floats
@@ -40,16 +40,15 @@ Eye = Callable[[Pixels], Look]  # finds tokens in a picture (P, P)
 
 
 class Sight:
-    """What is seen of B environments.
+    """Tokens and targets as found in pictures of B environments.
 
     Attributes:
-        corners: (B, V, 2) of the tokens; of one that is missing where it lay last, or was told to
-            go, and before it was ever found in the middle of the arena.
+        corners: (B, V, 2) of the tokens. A token that is not found keeps its last pose, moved as
+            commanded; before it is first found, this is the middle of the arena.
         missing: (B, K) tokens that are not found, or not surely.
-        away: (B, K) tokens not surely seen that should have left the picture by what they were
-            told.
-        goals: (B, V, 2) of the target; a piece that is not found lies where its token began.
-        goals_sure: (B, K) which of its pieces are surely seen.
+        away: (B, K) missing tokens whose estimated pose reaches out of the picture.
+        goals: (B, V, 2) of the target; a piece that is not found gets its token's first pose.
+        goals_sure: (B, K) target pieces that are surely found.
     """
 
     def __init__(self, layout: Layout, eye: Eye, count: int, arena: float) -> None:
@@ -73,10 +72,13 @@ class Sight:
         goals: Floats | None = None,
         named: Floats | float = 0.0,
     ) -> None:
-        """Look at pictures (B, P, P) of targets and starts, or of starts where goals are known.
+        """Look at the first pictures of an episode.
 
-        Goals (B, V, 2) are as a look before has found them; by poses `named` (B, K, 3), where they
-        are given, equal tokens are told apart.
+        Args:
+            targets: (B, P, P) of the targets; ignored if `goals` are given.
+            states: (B, P, P) of the tokens.
+            goals: (B, V, 2) as an earlier look found them; None: find them in `targets`.
+            named: (B, K, 3) earlier poses of the tokens, to tell equal ones apart.
         """
         self._poses[:], self._flipped[:] = named, False
         self.missing = np.ones_like(self.missing)
@@ -88,17 +90,17 @@ class Sight:
         poses, flipped, sure = self._poses.copy(), self._flipped.copy(), ~self.missing
         for b, target in enumerate(targets):
             look = self._eye(target)
-            known = look.known  # a piece that could lie otherwise as well is covered there, too
+            known = look.known  # an unsure piece, too: the target covers its place
             poses[b, known], flipped[b, known] = look.poses[known], look.flipped[known]
             sure[b] = look.sure
         self.goals, self.goals_sure = self._layout.corners(poses, flipped), sure
 
     def follow(self, states: Pixels, moved: Ints, ways: Floats) -> None:
-        """Look at pictures (B, P, P) after tokens (B,), as the agent names them, have moved.
+        """Look at pictures (B, P, P) after tokens `moved` (B,) have moved.
 
-        They were told to go ways (B, 3): x, y and turn.
+        `moved` are the agent's indices, `ways` (B, 3) the commanded motions: x, y and angle.
         """
-        # What was given away before stays as it is.
+        # A copy: arrays handed out before must not change.
         self.missing = self.missing.copy()
         for b, (state, token) in enumerate(zip(states, moved.tolist(), strict=True)):
             self._take(b, self._eye(state), token, ways[b])
@@ -108,9 +110,9 @@ class Sight:
         self.away = self.missing & out
 
     def hands(self, tokens: Ints, corners: Floats) -> Ints:
-        """(B,) which tokens of the world lie where the agent sees tokens (B,): those it would grab.
+        """Indices (B,) in the world of the tokens (B,) that the agent names: those it would grab.
 
-        The corners (B, V, 2) are as they are.
+        `corners` (B, V, 2) are the exact ones.
         """
         found, true = tokens.copy(), self._layout.bases(corners)
         for b, token in enumerate(tokens.tolist()):
@@ -122,11 +124,11 @@ class Sight:
         return found
 
     def _take(self, b: int, look: Look, moved: int, way: Floats) -> None:
-        """Take over what was seen of an environment, after a token was told to go a way (3,)."""
+        """Update the poses of one environment after a token was commanded to move by `way` (3,)."""
         missing, gone = np.ones_like(self.missing[b]), self.missing[b]
         for alike in self._alike:
             shown = alike[look.known[alike]]
-            # Those that did not move say which one did.
+            # Match tokens that did not move first: the one left over has moved.
             still = [i for i, one in enumerate(alike) if one != moved and not gone[one]]
             of = _nearest(self._poses[b, alike, :2], look.poses[shown, :2], still)
             for i, token in enumerate(alike.tolist()):
@@ -141,20 +143,20 @@ class Sight:
         self.missing[b] = missing
 
     def _near(self, b: int, token: int, pose: Floats, told: float) -> Floats:
-        """A pose (3,) of a token at that of the turns that look alike which it made."""
+        """A found pose (3,), with the likeliest of the angles that look the same."""
         before, step = self._poses[b, token], 2.0 * np.pi / self._layout.symmetries[token]
         way = pose - before
         stayed = way[2] - step * np.round(way[2] / step)
-        # What looks as before did not move, whatever it was told.
+        # A token that looks as before did not move, whatever the command.
         if np.hypot(*way[:2]) > _STILL * self._layout.radii[token] or abs(stayed) > _STILL:
             stayed = way[2] - step * np.round((way[2] - told) / step)
         return np.array([*pose[:2], before[2] + stayed])
 
 
 def _nearest(places: Floats, others: Floats, first: Sequence[int]) -> list[int]:
-    """For each of places (n, 2) another one of others (m, 2), nearest first; m where none is left.
+    """Match places (n, 2) to different ones of others (m, 2), nearest pairs first.
 
-    Those of the n that are `first` choose before the rest does.
+    Places in `first` are matched before the rest. The result is m for a place without a match.
     """
     far = np.linalg.norm(places[:, None] - others[None], axis=-1)
     chosen = [len(others)] * len(places)

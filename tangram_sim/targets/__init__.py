@@ -1,4 +1,4 @@
-"""What is to be assembled in an episode, and from where: targets and starts.
+"""Targets and starts of episodes.
 
 Start with `targets.py`. May import tangram_sim.motion, puzzles and geometry; no engine.
 """

@@ -1,7 +1,7 @@
-"""Pieces that hang together: each shares a part of an edge with one before it.
+"""Random targets of connected pieces: each shares a part of an edge with an earlier piece.
 
 Points and directions are complex numbers here. Legend: n candidates, k pieces laid before, C
-corners of a piece, filled up to those of the largest by repeating the last one, and edges alike.
+corners (and edges) of a piece, padded to those of the largest by repeating the last one.
 """
 
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.targets.sampling import MAX_TRIES, check_fits
 
-_CHUNK = 16  # candidates that are checked together
-_ALIGNED = 0.7  # share of pieces that meet another corner to corner
-_TOUCHING = 1e-9  # depth of an overlap, as a share of the arena: rounding
-MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
+_CHUNK = 16  # candidates checked together
+_ALIGNED = 0.7  # share of pieces laid with a corner at a corner of the other piece
+_TOUCHING = 1e-9  # depth of an overlap that counts as rounding, as a share of the arena
+MAX_PILE = 3  # touching tokens that can be found in a picture; for more the search is too slow
 
 
 def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
-    """One layout (K, 3) whose pieces hang together edge to edge, no token on its other side.
+    """Random poses (K, 3) of pieces that are connected edge to edge; none is turned over.
 
-    The pieces come in random order; each is laid with a random edge along a random edge of a
-    random one before it, mostly corner to corner. The whole is turned and moved by chance.
+    The pieces come in random order. Each is laid with a random edge along a random edge of a
+    random earlier piece, mostly corner to corner. The whole gets a random rotation and shift.
 
     Raises:
-        SamplingError: a token does not fit into the arena, or no place was found for one in
-            `MAX_TRIES` tries.
+        SamplingError: a token does not fit into the arena, or `MAX_TRIES` tries found no place
+            for it.
     """
     check_fits(layout, sim)
     order = rng.permutation(layout.tokens)
@@ -37,7 +37,7 @@ def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -
 
 
 def _chained(layout: Layout, order: Ints, sim: SimConfig, rng: np.random.Generator) -> Floats:
-    """Poses (K, 3) in which each token of an order (K,) touches one before it."""
+    """Poses (K, 3) in which each token of an order (K,) touches an earlier one."""
     bodies = _bodies(layout)
     turns, shifts = np.ones(layout.tokens, np.complex128), np.zeros(layout.tokens, np.complex128)
     for number, token in enumerate(order[1:], 1):
@@ -53,9 +53,9 @@ class _Outlines:
 
     Attributes:
         corners: (..., C), counter-clockwise.
-        edges: (..., C) unit vectors along the edge behind each corner.
+        edges: (..., C) unit vectors along the edge after each corner.
         lengths: (..., C) of the edges.
-        count: (...,) how many corners there really are.
+        count: (...,) number of corners without padding.
     """
 
     corners: Complex
@@ -64,13 +64,13 @@ class _Outlines:
     count: Ints
 
     def of(self, which: Ints) -> "_Outlines":
-        """The outlines of these tokens."""
+        """The outlines of the tokens `which`."""
         return _Outlines(
             self.corners[which], self.edges[which], self.lengths[which], self.count[which]
         )
 
     def moved(self, turn: Complex, shift: Complex) -> "_Outlines":
-        """The outlines turned by a complex number of length 1, then shifted."""
+        """The outlines rotated by a complex number of length 1, then shifted."""
         corners = self.corners * turn + shift
         return _Outlines(corners, self.edges * turn, self.lengths, self.count)
 
@@ -89,7 +89,7 @@ def _bodies(layout: Layout) -> _Outlines:
 def _attached(
     piece: _Outlines, laid: _Outlines, sim: SimConfig, rng: np.random.Generator
 ) -> tuple[complex, complex]:
-    """Turn and shift of a piece that touches one of the others and overlaps none."""
+    """Rotation and shift of a piece that touches one of the others and overlaps none."""
     for _ in range(-(-MAX_TRIES // _CHUNK)):
         turn, shift = _candidates(piece, laid, rng)
         moved = piece.moved(turn[:, None], shift[:, None])
@@ -107,13 +107,13 @@ def _attached(
 def _candidates(
     piece: _Outlines, laid: _Outlines, rng: np.random.Generator
 ) -> tuple[Complex, Complex]:
-    """Turns and shifts (n,): a random edge along a random edge of the others, back to back."""
+    """Rotations and shifts (n,) that lay a random edge along a random edge of the others."""
     drawn = rng.random((_CHUNK, 4))
     other = (drawn[:, 0] * len(laid.corners)).astype(np.int64)
     i = (drawn[:, 1] * laid.count[other]).astype(np.int64)
     j = (drawn[:, 2] * piece.count).astype(np.int64)
     along, length, own = laid.edges[other, i], laid.lengths[other, i], piece.lengths[j]
-    # The piece's edge ends so far from the other's start, and lies from there on beside it.
+    # Distance from the start of the other's edge to the end of the piece's edge, along the edge.
     free = (drawn[:, 3] - _ALIGNED) / (1.0 - _ALIGNED)
     anywhere = -0.8 * own + free * (length + 0.6 * own)
     aligned = np.where(drawn[:, 3] < _ALIGNED / 2.0, 0.0, length - own)
@@ -125,21 +125,21 @@ def _candidates(
 def _apart(pieces: _Outlines, laid: _Outlines, depth: float) -> Bools:
     """(n,) whether a piece overlaps none of the others by more than a depth.
 
-    Two convex pieces lie apart where one has an edge that all of the other lies outside of.
+    Two convex pieces are apart if all of one lies outside an edge of the other.
     """
     outside = _outside(pieces, laid, depth) | _outside(laid, pieces, depth).T
     return np.asarray(outside.all(axis=1))
 
 
 def _outside(pieces: _Outlines, others: _Outlines, depth: float) -> Bools:
-    """(n, k) whether a piece has an edge that all of the other lies outside of."""
+    """(n, k) whether all of the other piece lies outside some edge of a piece."""
     gap = others.corners[None, :, None] - pieces.corners[:, None, :, None]
     inwards = (pieces.edges.conj()[:, None, :, None] * gap).imag
     return np.asarray((inwards <= depth).all(axis=-1).any(axis=-1))
 
 
 def _laid_out(layout: Layout, poses: Floats, sim: SimConfig, rng: np.random.Generator) -> Floats:
-    """The whole turned by any angle and moved to where all of its tokens lie in the arena."""
+    """The whole at a random angle, and at a random place with all tokens in the arena."""
     turn = rng.uniform(-np.pi, np.pi)
     centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * turn)
     turned = np.column_stack([centres.real, centres.imag, poses[:, 2] + turn])

@@ -1,11 +1,11 @@
-"""Layouts without overlap, token after token.
+"""Random layouts without overlap, drawn token by token.
 
-Tokens are placed one after the other, the largest first, each over the poses that those before it
-leave free. Drawing whole layouts and rejecting those with an overlap would be uniform over
-layouts, but hardly ever succeeds for seven tokens that fill a tenth of the arena.
+The largest token comes first. Each pose is uniform over those that the earlier tokens leave free.
+Rejecting whole layouts with an overlap would be uniform over layouts. But it hardly ever succeeds
+for seven tokens that fill a tenth of the arena.
 
-Each environment draws from its own generator only: what it gets does not depend on the others of
-the batch, which are only checked together for speed.
+Each environment draws from its own generator only. So its layout does not depend on the others of
+the batch, which are checked together for speed.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines_at, pairs_overlap
 
 MAX_TRIES = 1000  # random poses tried for one token before sampling gives up
-_CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
-_CLEAR_TRIES = 64  # outside of what is only to be avoided; then anywhere
+_CHUNK = 4  # poses drawn at once when some may overlap, for fewer and larger checks
+_CLEAR_TRIES = 64  # tries to keep clear of `avoid`; then it is ignored
 
 Generators = Sequence[np.random.Generator]
 
@@ -33,21 +33,21 @@ def sample_batch(
     flipped: Bools | None = None,
     avoid: Floats | None = None,
 ) -> Floats:
-    """One layout per generator: (B, K, 3) of x, y (arena units) and angle in (-pi, pi].
+    """One random layout per generator: poses (B, K, 3), angles in (-pi, pi].
 
-    Middles lie in the square that keeps the token inside the arena at every angle, or with
-    `sim.overhang` in the arena; angles are uniform, and no two tokens of a layout overlap.
+    Angles are uniform, and no two tokens of a layout overlap. A token's centre lies where the token
+    is inside the arena at every angle, or, with `sim.overhang`, anywhere in the arena.
 
     Args:
         layout: the tokens.
-        sim: the arena.
+        sim: settings of the world, for the arena.
         generators: one for each of B environments.
-        flipped: (B, K) tokens that lie on their other side; None: none does.
+        flipped: (B, K) tokens that are turned over; None: no token is.
         avoid: (B, M, C, 2) outlines that tokens keep clear of where there is room.
 
     Raises:
-        SamplingError: a token does not fit into the arena, or `MAX_TRIES` poses for one all
-            overlapped those before it.
+        SamplingError: a token does not fit into the arena, or all `MAX_TRIES` poses of a token
+            overlapped earlier tokens.
     """
     reach = check_fits(layout, sim)
     poses = np.empty((len(generators), layout.tokens, 3))
@@ -69,13 +69,13 @@ def sample_batch(
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A token that is to be placed.
+    """A token to be placed.
 
     Attributes:
         name: of its shape.
         body: (C, 2) corners.
-        reach: how far out its centre may be.
-        flipped: (B,) on its other side.
+        reach: largest |coordinate| of its centre.
+        flipped: (B,) whether it is turned over.
     """
 
     name: str
@@ -87,7 +87,7 @@ class _Piece:
 def _place(
     piece: _Piece, placed: Floats, avoid: Floats | None, generators: Generators, poses: Floats
 ) -> bool:
-    """Fill the poses (B, 3) of one token, clear of those placed (B, k, C, 2); whether it could."""
+    """Fill the poses (B, 3) of a token, clear of placed ones (B, k, C, 2); return success."""
     open_rows = np.arange(len(poses))
     if avoid is not None:
         both = np.concatenate([placed, avoid], axis=1)
@@ -103,7 +103,7 @@ def _try(
     open_rows: Ints,
     limit: int,
 ) -> Ints:
-    """Fill the open rows of poses (B, 3) with a free one of `limit` poses; return the rest."""
+    """Fill open rows of poses (B, 3) in at most `limit` tries each; return rows still open."""
     chunk = _CHUNK if obstacles.shape[1] else 1
     tries = 0
     while len(open_rows) and tries < limit:
@@ -120,7 +120,7 @@ def _try(
 
 
 def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) -> Bools:
-    """(B, size), which of the poses (B, size, 3) overlap an obstacle (B, k, C, 2)."""
+    """(B, size) which of the poses (B, size, 3) overlap an obstacle (B, k, C, 2)."""
     rows, size, before = *drawn.shape[:2], obstacles.shape[1]
     if not before:
         return np.zeros((rows, size), dtype=np.bool_)
@@ -131,7 +131,7 @@ def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) ->
 
 
 def check_fits(layout: Layout, sim: SimConfig) -> Floats:
-    """(K,) largest coordinate of each token's middle; SamplingError if the arena is too small."""
+    """(K,) largest |coordinate| of each token's centre; SamplingError if it does not fit."""
     reach: Floats = sim.arena / 2.0 - layout.radii
     if (reach < 0.0).any():
         worst = layout.shapes[int(np.argmin(reach))]

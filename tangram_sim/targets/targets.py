@@ -1,7 +1,7 @@
-"""What is to be assembled in an episode: targets by the kinds of `SimConfig.targets`, and starts.
+"""Random targets and starts of episodes; `SimConfig.targets` gives the kind of targets.
 
-Legend: B environments, K tokens. A layout is poses (B, K, 3) and sides (B, K): which tokens lie on
-their other side.
+Legend: B environments, K tokens. Targets and starts are poses (B, K, 3) and sides (B, K): which
+tokens are turned over.
 """
 
 from functools import lru_cache
@@ -26,15 +26,15 @@ from tangram_sim.targets.sampling import Generators, sample_batch
 
 Sides = tuple[Floats, Bools]
 _NO_TURN = 1e-6  # radians
-MIN_THICKNESS = 1e-3  # of a token, arenas
+MIN_THICKNESS = 1e-3  # of a token, as a share of the arena's width
 
 
 def sample_targets(layout: Layout, sim: SimConfig, generators: Generators) -> Sides:
-    """One target per generator.
+    """One random target per generator: poses (B, K, 3) and sides (B, K).
 
     Raises:
-        SamplingError: no room.
-        ConfigError: figures, and the tokens are not all seven tans.
+        SamplingError: the arena has no room for a token.
+        ConfigError: the targets are figures, but the tokens are not all seven tans.
     """
     kinds = [_kind(sim, rng) for rng in generators]
     flipped = _sides(layout, sim, generators)
@@ -54,10 +54,12 @@ def sample_targets(layout: Layout, sim: SimConfig, generators: Generators) -> Si
 
 
 def sample_starts(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
-    """One start per generator: on the target's sides, or on any with `allow_flip`.
+    """One random start per generator: poses (B, K, 3) and sides (B, K).
+
+    Sides are those of the target, or random with `allow_flip`.
 
     Raises:
-        SamplingError: no room.
+        SamplingError: the arena has no room for a token.
     """
     flipped = targets[1]
     if sim.allow_flip:
@@ -69,7 +71,7 @@ def sample_starts(layout: Layout, sim: SimConfig, targets: Sides, generators: Ge
 
 
 def check_targets(layout: Layout, sim: SimConfig) -> None:
-    """Raise ConfigError, which names the setting, for what these tokens cannot play."""
+    """Check that settings of the world suit these tokens; ConfigError names a wrong setting."""
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
             "sim.allow_flip=true needs a token that is not its own mirror image, got tokens "
@@ -83,49 +85,49 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         _check_names(layout, sim.observe)
     if sim.observe == "pictures" and sim.targets != "uniform" and layout.tokens > MAX_PILE:
         raise ConfigError(
-            f"sim.observe=pictures tells at most {MAX_PILE} tokens that touch from each other, got "
-            f"{layout.tokens} in sim.targets={sim.targets}: set sim.targets=uniform, or "
+            f"sim.observe=pictures can tell at most {MAX_PILE} touching tokens apart, got "
+            f"{layout.tokens} with sim.targets={sim.targets}: set sim.targets=uniform, or "
             "sim.observe=corners"
         )
     _check_figures(layout, sim)
 
 
 def _check_names(layout: Layout, observe: str) -> None:
-    """What is found in pictures has no name: tokens of one name must be equal, others unlike."""
+    """Check that tokens of one name are equal and others differ: pictures show no names."""
     for one, other in combinations(layout.shapes, 2):
         turn = _turn_of(one, other)
         if one.name == other.name:
             if turn is None or turn[1] or abs(turn[0]) > _NO_TURN:
                 raise ConfigError(
-                    f"sim.observe={observe} takes tokens of one name for equal, and two of "
-                    f"{one.name} have other corners: give them names of their own"
+                    f"sim.observe={observe} needs equal corners for tokens of one name, and two "
+                    f"tokens {one.name} differ: give them different names"
                 )
         elif turn is not None:
             raise ConfigError(
                 f"sim.observe={observe} cannot tell {one.name} from {other.name}, which may look "
-                "alike: take equal tokens of one name, or set sim.observe=corners"
+                "alike: give equal tokens one name, or set sim.observe=corners"
             )
 
 
 def _check_thick(layout: Layout, sim: SimConfig) -> None:
-    """Refuse what is lost in its arena."""
+    """Raise ConfigError if a token is too thin for its arena."""
     shape = min(layout.shapes, key=lambda one: thickness(one.corners))
     thin = thickness(shape.corners)
     if thin < MIN_THICKNESS * sim.arena:
         raise ConfigError(
             f"token '{shape.name}' must be at least {MIN_THICKNESS * sim.arena:g} thick (twice its "
-            f"area by its perimeter) in an arena of width {sim.arena:g}, got {thin:.3g}: raise "
+            f"area / perimeter) in an arena of width {sim.arena:g}, got {thin:.3g}: raise "
             "tokens.scale, or lower sim.arena"
         )
 
 
 def placement(puzzle: Puzzle, layout: Layout) -> Sides:
-    """Poses (K, 3) and sides (K,) of a puzzle's pieces as tokens of a layout.
+    """Poses (K, 3) and sides (K,) of a layout's tokens in a puzzle.
 
-    Equal pieces are taken in order. A mirrored parallelogram is one that lies on its other side.
+    Equal pieces are taken in order. A mirrored parallelogram is a parallelogram turned over.
 
     Raises:
-        ConfigError: the layout's tokens are not the puzzle's pieces, or of another size.
+        ConfigError: the layout's tokens are not the puzzle's pieces, or have another size.
     """
     left = list(range(len(puzzle.pieces)))
     poses, flipped = np.empty((layout.tokens, 3)), np.zeros(layout.tokens, dtype=np.bool_)
@@ -152,7 +154,7 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
 
 
 def _turn_of(shape: Shape, other: Shape) -> tuple[float, bool] | None:
-    """The angle by which a shape is another one, and whether on its other side, or None."""
+    """Angle and side at which a shape equals another one; None if it does not."""
     for flipped, corners in ((False, shape.corners), (True, mirror_image(shape.corners))):
         turn = turn_onto(corners, other.corners)
         if turn is not None:
@@ -167,7 +169,7 @@ def _kind(sim: SimConfig, rng: np.random.Generator) -> str:
 
 
 def _sides(layout: Layout, sim: SimConfig, generators: Generators) -> Bools:
-    """(B, K) sides: all chiral tokens on the other one in a share `mirrored` of the episodes."""
+    """(B, K) sides: in a share `mirrored` of episodes all chiral tokens are turned over."""
     flipped = np.zeros((len(generators), layout.tokens), dtype=np.bool_)
     if sim.mirrored > 0.0 and layout.any_chiral:
         flipped[:] = np.array([rng.random() < sim.mirrored for rng in generators])[:, None]
@@ -175,7 +177,7 @@ def _sides(layout: Layout, sim: SimConfig, generators: Generators) -> Bools:
 
 
 def _figure(layout: Layout, mirrored: bool, rng: np.random.Generator) -> Sides:
-    """A figure of the train split at any angle, in the middle of the arena."""
+    """A random figure of the train split at a random angle, in the middle of the arena."""
     figures = _figures(layout)
     poses, flipped = figures[int(rng.integers(len(figures)))]
     if mirrored:
@@ -184,9 +186,9 @@ def _figure(layout: Layout, mirrored: bool, rng: np.random.Generator) -> Sides:
 
 
 def turned_figure(layout: Layout, figure: Sides, angle: float) -> Floats:
-    """Poses (K, 3) of a figure turned by an angle, in the middle of the arena.
+    """Poses (K, 3) of a figure rotated by an angle (rad) and centred in the arena.
 
-    Angles are in (-pi, pi].
+    The angles of the poses are in (-pi, pi].
     """
     poses, flipped = figure
     centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * angle)
@@ -209,7 +211,7 @@ def _scale(layout: Layout) -> float:
 
 
 def _check_figures(layout: Layout, sim: SimConfig) -> None:
-    """Raise unless every figure is one of the tokens and fits into the arena at any angle."""
+    """Raise unless the tokens make every figure, and it fits into the arena at any angle."""
     if sim.targets not in ("figures", "touching"):
         return
     if not has_all_tans(layout):
@@ -226,10 +228,10 @@ def _check_figures(layout: Layout, sim: SimConfig) -> None:
 
 
 def has_all_tans(layout: Layout) -> bool:
-    """Whether the tokens are the seven tans, which every figure has."""
+    """Whether the tokens are the seven tans, so that they can make every figure."""
     return _tans(layout) == sorted(name for name, count in COUNTS.items() for _ in range(count))
 
 
 def _tans(layout: Layout) -> list[str]:
-    """Names of the tokens, sorted; on which side one lies does not matter."""
+    """Names of the tokens, sorted; sides do not matter."""
     return sorted(kind_of(shape.name) for shape in layout.shapes)

@@ -1,9 +1,9 @@
-"""A robot's arm with a peg: the Franka Panda that comes with PyBullet, in a client of its own.
+"""A robot's arm with a peg: PyBullet's Franka Panda, in a client without tokens.
 
-It goes where a finger would, as joints that have limits, speeds and forces allow. What tokens do
-against its peg is small beside its motors and is left out: they follow the peg, not the peg them.
+The peg follows the finger's path within the limits of the joints' angles, speeds and forces. Forces
+of tokens on the peg are left out, since they are small beside those of the arm's motors.
 
-Lengths are metres, the table's middle is the origin, z is up. Legend: N moments, W way points.
+Lengths are metres, the table's middle is the origin, z is up. Legend: N moments.
 """
 
 from collections.abc import Sequence
@@ -15,28 +15,28 @@ import numpy as np
 from tangram_core.arrays import Floats
 from tangram_sim.world.engine import Client, pybullet
 
-METRES = 0.2  # of an arena unit: a table 0.4 m wide lies where the arm reaches all of it
+METRES = 0.2  # length of an arena unit: the arm reaches all of a table 0.4 m wide
 LIFTED, LOWERED = 0.06, 0.008  # heights of the peg's tip
 BASE = (-0.5, 0.0, 0.0)
-_PEG = 0.1  # from between the gripper's fingers down to the tip
+_PEG = 0.1  # from the gripper's grasp point down to the tip
 _JOINTS, _GRASP = tuple(range(7)), 11
 HOME = (0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785)
 _DOWN = (1.0, 0.0, 0.0, 0.0)  # the gripper's orientation
 _STEP = 1.0 / 240.0  # seconds
-_SOLVES, _CLOSE = 40, 1e-6  # of the inverse kinematics, from where the joints are
-_OFF = 0.002  # of the tip from where it should be: more, and it does not get there
-_SPEEDS = {"travel": 0.3, "down": 0.15, "push": 0.1, "up": 0.15}  # metres a second, at most
+_SOLVES, _CLOSE = 40, 1e-6  # iterations and residual of the inverse kinematics
+_OFF = 0.002  # largest error of the tip; with more a push has failed
+_SPEEDS = {"travel": 0.3, "down": 0.15, "push": 0.1, "up": 0.15}  # highest, metres per second
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What an arm did.
+    """A recorded motion of an arm.
 
     Attributes:
-        seconds: (N,) from the motion's beginning.
-        tips: (N, 3) where the peg's tip was.
-        joints: (N, 7) angles.
-        parts: (N,) which of travel, down, push and up it was.
+        seconds: (N,) since the motion began.
+        tips: (N, 3) positions of the peg's tip.
+        joints: (N, 7) angles of the joints.
+        parts: (N,) part of the motion: travel, down, push or up.
     """
 
     seconds: Floats
@@ -46,28 +46,28 @@ class Motion:
 
     @property
     def pushed(self) -> Floats:
-        """(n, 2) the way of the tip while it pushed."""
+        """Path (n, 2) of the tip while it pushed."""
         return self.tips[[part == "push" for part in self.parts], :2]
 
 
 def way_points(begin: Floats, way: Floats) -> list[tuple[str, Floats]]:
-    """Where a tip goes to push from `begin` (2,) by `way` (2,): parts and their ends (3,)."""
+    """Parts of a push from `begin` (2,) by `way` (2,), each with the tip's end point (3,)."""
     end = begin + way
     places = (begin, LIFTED), (begin, LOWERED), (end, LOWERED), (end, LIFTED)
     return [(name, np.array([*at, z])) for name, (at, z) in zip(_SPEEDS, places, strict=True)]
 
 
 def duration(part: str, length: float) -> float:
-    """Seconds of a part of so many metres, from rest to rest: half as fast again in the middle."""
-    return 1.5 * length / _SPEEDS[part]
+    """Seconds that a part of a push takes over a length in metres, from rest to rest."""
+    return 1.5 * length / _SPEEDS[part]  # the highest speed is 1.5 times the mean
 
 
 class Panda(Client):
-    """An arm at the table's left side."""
+    """A simulated Franka Panda arm at the left side of the table."""
 
     def __init__(self) -> None:
-        """Set it up, above the table's middle."""
-        import pybullet_data  # noqa: PLC0415 - comes with pybullet, and takes its time
+        """Load the arm, with its tip above the table's middle."""
+        import pybullet_data  # noqa: PLC0415 - comes with pybullet, slow to import
 
         super().__init__()
         model = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
@@ -80,12 +80,12 @@ class Panda(Client):
         self.home()
 
     def home(self) -> None:
-        """Back to where it begins, at rest."""
+        """Put the arm at its first position, at rest."""
         self.at(HOME)
         self.at(self._solved(np.array([0.0, 0.0, LIFTED])))
 
     def at(self, joints: Sequence[float]) -> None:
-        """Put the joints (7,) at angles, at rest."""
+        """Put the joints at angles (7,), at rest."""
         for joint, angle in zip(_JOINTS, joints, strict=True):
             pybullet.resetJointState(self.body, joint, angle, physicsClientId=self.client)
 
@@ -93,7 +93,7 @@ class Panda(Client):
         """Travel to `begin` (2,), come down, push by `way` (2,), and lift.
 
         Returns:
-            What it did; None where its tip, a joint's angle or a joint's speed went astray.
+            The motion; None if the tip left its path, or a joint exceeded its angles or speed.
         """
         here, seconds, found = self._tip(), 0.0, list[tuple[float, Floats, Floats, str]]()
         for part, there in way_points(begin, way):
@@ -101,7 +101,7 @@ class Panda(Client):
             count = max(1, round(duration(part, length) / _STEP))
             for step in range(1, count + 1):
                 share = step / count
-                share *= share * (3.0 - 2.0 * share)  # from rest to rest
+                share *= share * (3.0 - 2.0 * share)  # smooth, from rest to rest
                 aim = here + share * (there - here)
                 joints, speeds = self._moved(aim)
                 seconds += _STEP
@@ -115,7 +115,7 @@ class Panda(Client):
         return Motion(np.array(times), np.array(tips), np.array(angles), parts)
 
     def _moved(self, aim: Floats) -> tuple[Floats, Floats]:
-        """Joints' angles and speeds (7,), a step later."""
+        """Angles and speeds (7,) of the joints after a step towards `aim`."""
         pybullet.setJointMotorControlArray(
             self.body,
             _JOINTS,
@@ -141,7 +141,7 @@ class Panda(Client):
         return np.array(state[4]) - (0.0, 0.0, _PEG)
 
     def _angles(self, tip: Floats) -> list[float]:
-        """Of the joints, near where they are, for a tip (3,)."""
+        """Angles of the joints for a tip (3,), found from the present angles."""
         x, y, z = tip.tolist()
         found = pybullet.calculateInverseKinematics(
             self.body,

@@ -1,4 +1,4 @@
-"""The engine's camera: straight from above, exactly a square about the arena's middle."""
+"""The engine's camera: it looks straight down on a square around the middle of the arena."""
 
 import math
 
@@ -7,8 +7,8 @@ import numpy as np
 from tangram_core.arrays import Pixels
 from tangram_sim.world.engine import pybullet
 
-# TinyRenderer draws nothing with an orthographic projection. From this far above, the picture of
-# the arena differs from one by less than a tenth of a pixel at 1024 pixels.
+# TinyRenderer draws nothing with an orthographic projection. From this height the perspective
+# differs from it by less than a tenth of a pixel at 1024 pixels.
 _CAMERA_HEIGHT = 100.0
 _DEPTH = 10.0
 
@@ -17,11 +17,11 @@ class Camera:
     """A camera of one PyBullet client."""
 
     def __init__(self, client: int, pixels: int, width: float, top: float) -> None:
-        """Point the camera down; width of what it shows, and height of tokens, engine units."""
+        """Point the camera down; `width` of the view and `top` of tokens are in engine units."""
         self._client = client
         self._pixels = pixels
-        # TinyRenderer samples a pixel at its lower left corner, so the camera stands half a pixel
-        # to the right and up: then a pixel shows its centre.
+        # TinyRenderer samples a pixel at its lower left corner. The camera stands half a pixel to
+        # the right and up, so that a pixel shows its centre.
         shift, height = width / pixels / 2.0, _CAMERA_HEIGHT + top
         self._view = pybullet.computeViewMatrix(
             (shift, shift, height), (shift, shift, 0.0), (0.0, 1.0, 0.0)
@@ -34,14 +34,14 @@ class Camera:
         )
 
     def picture(self) -> Pixels:
-        """(P, P) grayscale, see `World.picture`."""
+        """Grayscale picture (P, P), see `World.picture`."""
         image = pybullet.getCameraImage(
             self._pixels,
             self._pixels,
             self._view,
             self._projection,
             shadow=0,
-            # Even light from everywhere: a token has one gray, as in the kinematic world.
+            # Ambient light only: tokens have a uniform gray, as in the kinematic world.
             lightAmbientCoeff=1.0,
             lightDiffuseCoeff=0.0,
             lightSpecularCoeff=0.0,

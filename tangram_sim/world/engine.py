@@ -1,4 +1,4 @@
-"""PyBullet, without the line about its build that it prints whenever it is imported."""
+"""PyBullet, imported without the line about its build that it prints."""
 
 import os
 import weakref
@@ -10,7 +10,7 @@ from tangram_core.errors import TangramError
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Send what C code writes to stderr nowhere: sys.stderr is not asked by it."""
+    """Discard what C code writes to stderr; replacing sys.stderr does not affect C code."""
     try:
         kept = os.dup(2)
     except OSError:  # this process has no stderr
@@ -33,10 +33,10 @@ __all__ = ["Client", "pybullet"]
 
 
 class Client:
-    """One PyBullet client of its own, in DIRECT mode, for whatever moves bodies.
+    """A new PyBullet client in DIRECT mode; base class of all that moves bodies.
 
     Attributes:
-        client: its number.
+        client: number of the client.
     """
 
     def __init__(self) -> None:
@@ -49,5 +49,5 @@ class Client:
         self._finalizer = weakref.finalize(self, pybullet.disconnect, self.client)
 
     def close(self) -> None:
-        """Give the client back; again is no harm."""
+        """Disconnect the client; further calls do nothing."""
         self._finalizer()

@@ -1,7 +1,7 @@
-"""Tokens as rigid bodies in PyBullet: the only module, with camera.py, that knows the engine.
+"""Tokens as rigid bodies in PyBullet, carried through the air.
 
-The engine always sees an arena of width 2, whatever the arena's unit: its tolerances, its limit of
-100 units a second and the camera are made for bodies of about that size.
+In engine units the arena always has width 2. The engine's tolerances, its limit of 100 units per
+second and the camera suit bodies of this size.
 """
 
 import math
@@ -18,34 +18,34 @@ from tangram_sim.sight.pictures import BACKGROUND, TOKEN_GRAY, averaged, taken_p
 from tangram_sim.world.camera import Camera
 from tangram_sim.world.engine import Client, pybullet
 
-_HALF_HEIGHT = 0.01  # of a token as it is drawn
-# Of a token as it collides, where there are others: so tall that the shortest way out of another
-# is always sideways. Carried tokens pass above that.
+_HALF_HEIGHT = 0.01  # of a token in pictures
+# Half height of a token's collision shape: so tall that the shortest way out of another token is
+# always sideways. Carried tokens pass above.
 _WALL = 0.25
 _LIFTED = 3.0 * _WALL
-# Without a margin the engine misses one overlap in four and pushes upwards. What collides is
-# smaller by it on every side, so that pieces that only touch leave each other alone.
+# Without a margin the engine misses one overlap in four and pushes upwards. Collision shapes are
+# smaller by the margin on every side, so that pieces that only touch do not push each other.
 _MARGIN = 1e-4
-_UPRIGHT = 1e4  # inertia about x and y, far more than a token's: none tips over
-# Of the edges of tokens that are pushed apart, which the engine multiplies: 0.04 for two, so that
-# they glide and do not drag each other along.
+_UPRIGHT = 1e4  # inertia about x and y, so large that no token tips over
+# Friction of a token's edges. The engine multiplies those of both tokens: with 0.04 they glide and
+# do not drag each other along.
 _FRICTION = 0.2
-_RECOVERY = 0.5  # share of an overlap that one step removes while tokens settle
-_SETTLED = 1e-5  # deepest overlap that stays
+_RECOVERY = 0.5  # share of an overlap that one step removes
+_SETTLED = 1e-5  # deepest overlap that may stay
 _SETTLE_STEPS, _SETTLE_S = 200, 1.0 / 240.0
-_DISTANCE = 8  # of two bodies, in what the engine tells of a contact
+_DISTANCE = 8  # index of the distance in the engine's contact points
 
-# Least simulation steps in one action of one second. One step turns exactly up to pi / 4 and too
-# little beyond, so that a half turn needs four.
+# Simulation steps in an action of one second. A step is exact up to a rotation of pi / 4 and falls
+# short beyond, so half a turn needs at least four.
 _SUBSTEPS = 8
 
 _Command = tuple[float, float, float]
 
 
 class PhysicsWorld(Client):
-    """Prisms in one PyBullet client of their own, in DIRECT mode. See `World`.
+    """A world of prisms in its own PyBullet client; see `World`.
 
-    The bodies are made once and only moved: `resetSimulation` in a loop leaks memory.
+    The bodies are made once and then only moved: `resetSimulation` in a loop leaks memory.
     """
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
@@ -72,7 +72,7 @@ class PhysicsWorld(Client):
 
     def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
         """See `World.move`."""
-        # Every body rests between calls: `place` relies on the stop at the end.
+        # All bodies rest between calls. `place` relies on the stop at the end of a move.
         self._lift(token, self._command(velocity), flip)
 
     def poses(self) -> Floats:
@@ -94,13 +94,13 @@ class PhysicsWorld(Client):
         return x * self._unit, y * self._unit, angular
 
     def _lift(self, token: int, command: _Command, flip: bool) -> None:
-        """Carry a token above the others, set it down, and push apart what then overlaps."""
+        """Carry a token above the others, set it down, and push overlapping tokens apart."""
         if self._alone:
             self._carry(token, command, flip, 0.0)
             return
         poses = [self._pose(other) for other in range(len(self._bodies))]
         self._carry(token, command, flip, _LIFTED)
-        # While one is carried the rest of a settled overlap would make others creep.
+        # Restore the others: overlaps that remain after settling make them creep meanwhile.
         poses[token] = self._pose(token)
         self._put_all(poses)
         self._settle()
@@ -127,11 +127,10 @@ class PhysicsWorld(Client):
         self._play_at_once()
 
     def _forget_contacts(self) -> None:
-        """Clear the engine's contacts by putting every token at a height of its own.
+        """Clear the engine's contacts by putting every token at a different height.
 
-        The engine keeps the contacts of pairs that only move apart along the table.
-
-        Those of the last episode would throw tokens of the next through the arena.
+        The engine keeps contacts of pairs that move apart within the plane of the table. Contacts
+        of the last episode would throw tokens of the next one through the arena.
         """
         for token in range(len(self._bodies)):
             self._put(token, 0.0, 0.0, 0.0, height=(token + 1) * _LIFTED)
@@ -187,7 +186,7 @@ class PhysicsWorld(Client):
             -1,
             collisionMargin=margin,
             lateralFriction=_FRICTION,
-            # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
+            # With Bullet's default damping of 0.04 tokens would stop short.
             linearDamping=0.0,
             angularDamping=0.0,
             physicsClientId=self.client,
@@ -197,7 +196,7 @@ class PhysicsWorld(Client):
         return body
 
     def _keep_upright(self, body: int) -> None:
-        """Keep the inertia about the vertical alone, so that a body never tips over."""
+        """Let a body rotate about the vertical only, so that it never tips over."""
         mass, _, inertia, *_ = pybullet.getDynamicsInfo(body, -1, physicsClientId=self.client)
         pybullet.changeDynamics(
             body,
@@ -213,7 +212,7 @@ class PhysicsWorld(Client):
         )
 
     def _put(self, token: int, x: float, y: float, angle: float, height: float = 0.0) -> None:
-        """Set a token's pose, in engine units; it keeps the side that it lies on."""
+        """Set a token's pose in engine units, on the side that `_flipped` says."""
         cos, sin = math.cos(angle / 2.0), math.sin(angle / 2.0)
         pybullet.resetBasePositionAndOrientation(
             self._bodies[token],

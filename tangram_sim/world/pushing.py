@@ -1,12 +1,11 @@
 """Tokens on a table in PyBullet, and a finger that pushes them slowly.
 
-A push is quasi-static: friction is much more than inertia, and a token moves as far as something
-pushes it. The table's friction resists like an ellipsoid of force and moment (the limit surface of
-Goyal et al. 1991 as Lee and Cutkosky 1991 approximate it): then what moves, and how, is what the
-engine makes of contacts between bodies that forget their speed in every step, whose mass is the
-friction's strength, whose inertia is its moment, and whose centre of mass is the centre of
-pressure. Coulomb friction in the engine itself, with gravity, comes to nearly the same and needs
-steps a tenth as long.
+A push is quasi-static: friction outweighs inertia, and a token moves only while it is pushed. The
+friction of the table is an ellipsoid of force and moment: the limit surface of Goyal et al. 1991 in
+the approximation of Lee and Cutkosky 1991. The engine gives the same motion for bodies that lose
+their speed in every step, with these replacements: mass for the strength of the friction, inertia
+for its moment, centre of mass for the centre of pressure. Coulomb friction in the engine, with
+gravity, gives nearly the same result but needs steps a tenth as long.
 
 Lengths are arena units, in which the table is 2 wide. Legend: K tokens.
 """
@@ -23,29 +22,29 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.prisms import inset, prism
 from tangram_sim.world.engine import Client, pybullet
 
-# Of a token as it collides: so tall that the shortest way out of another is always sideways.
+# Half height of a collision shape: the shortest way out of another token is always sideways.
 _WALL = 0.25
-_MARGIN = 1e-3  # of what collides, which is smaller by it on every side
-_STEP = 1.0 / 120.0  # way of the finger in one step
-_LEAST = 1e-6  # way that is worth a step
-_ITERATIONS = 20  # of the engine's solver; 50 are its default
-_STIFF = 1e4  # inertia about x and y, far more than a token's: none tips over
-_FORCE = 1e4  # of the finger's motors: nothing that is pushed slows it down
+_MARGIN = 1e-3  # collision margin; shapes are smaller by this on every side
+_STEP = 1.0 / 120.0  # distance that the finger moves in one step
+_LEAST = 1e-6  # shortest distance worth a step
+_ITERATIONS = 20  # of the engine's solver; the default is 50
+_STIFF = 1e4  # inertia about x and y, so large that no token tips over
+_FORCE = 1e4  # of the finger's motors, so large that no token slows it down
 _ABOVE = 2.0  # height of the finger while it does not push
-_TOKENS = 0.5  # coefficient of a token, which the engine multiplies with the other's
+_TOKENS = 0.5  # friction of a token; the engine multiplies the coefficients of two bodies
 _NONE, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """What is drawn for an episode, and told to nobody.
+    """Random physical parameters of an episode, hidden from agents.
 
     Attributes:
         table: (K,) coefficients of friction of table and token; only their ratios count.
-        spread: (K,) square of the friction's lever, in squares of the token's radius of gyration:
-            .9 where it is pressed alike everywhere, 2 and more where its corners carry it.
+        spread: (K,) squared lever of the friction, divided by the token's squared radius of
+            gyration: .9 for uniform pressure, 2 or more if the corners carry the token.
         finger: coefficient of friction of finger and token.
-        centres: (K, 2) from each token's centre of area to its centre of mass, in its own frame.
+        centres: (K, 2) from a token's centre of area to its centre of mass, in the body frame.
     """
 
     table: Floats
@@ -55,14 +54,14 @@ class Unknowns:
 
 
 class PushTable(Client):
-    """Bodies in one PyBullet client of their own, in DIRECT mode."""
+    """A table with tokens and a finger, in its own PyBullet client."""
 
     def __init__(self, layout: Layout, finger: float) -> None:
         """Make an empty table.
 
         Args:
             layout: the tokens.
-            finger: its radius.
+            finger: radius of the finger.
         """
         self._layout, self._finger = layout, finger
         self._prisms = [prism(inset(shape.corners, _MARGIN), _WALL)[0] for shape in layout.shapes]
@@ -71,10 +70,10 @@ class PushTable(Client):
         self._bodies: dict[int, int] = {}  # token -> body
 
     def place(self, poses: Floats, present: Bools, unknowns: Unknowns) -> None:
-        """Lay the tokens (K, 3) that are present on an empty table.
+        """Lay the present tokens (K,) on an empty table, in poses (K, 3).
 
-        All is made anew: the engine keeps something of every contact, and an episode must not hang
-        on the one before it.
+        All bodies are made again: the engine remembers contacts, and an episode must not depend on
+        the one before.
         """
         self._call("resetSimulation")
         self._call(
@@ -90,19 +89,19 @@ class PushTable(Client):
         self.lay(poses)
 
     def lay(self, poses: Floats) -> None:
-        """Move the tokens on the table to poses (K, 3); the engine keeps what it kept."""
+        """Move the tokens on the table to poses (K, 3); the engine still remembers contacts."""
         for token in self._bodies:
             self._put(token, poses[token])
 
     def push(self, begin: Floats, way: Floats) -> None:
-        """Bring the finger down at `begin` (2,), move it by `way` (2,), not none, and lift it."""
+        """Bring the finger down at `begin` (2,), move it by `way` (2,), not zero, and lift it."""
         for _ in self.follow(np.stack([begin, begin + way])):
             pass
 
     def follow(self, path: Floats) -> Iterator[int]:
-        """The same along points (n, 2), step by step; yields the number of one where it is there.
+        """Push along points (n, 2); yield the number of each point when the finger is there.
 
-        Points within a step of the one before are left out, but for the last.
+        A point closer than one step to the point before is left out, except the last point.
         """
         self._finger_at(path[0], 0.0)
         at, last = path[0], len(path) - 1
@@ -113,9 +112,9 @@ class PushTable(Client):
                 continue
             at = there
             steps = max(1, math.ceil(length / _STEP - 1e-6))
-            # First: what a motor can do hangs on the step's length.
+            # Set first: the force limit of a motor depends on the length of the step.
             self._call("setPhysicsEngineParameter", fixedTimeStep=length, numSubSteps=steps)
-            self._call(  # a unit in a second
+            self._call(  # one unit per second
                 "setJointMotorControlArray",
                 self._pusher,
                 (0, 1, 2),
@@ -130,7 +129,7 @@ class PushTable(Client):
             self._put(token, self._pose(token))
 
     def poses(self) -> Floats:
-        """(K, 3) x, y and angle of every token; zeros of those that are away."""
+        """Poses (K, 3) of the tokens: x, y and angle; zeros for tokens that are not present."""
         poses = np.zeros((self._layout.tokens, 3))
         for token in self._bodies:
             poses[token] = self._pose(token)
@@ -144,7 +143,7 @@ class PushTable(Client):
             self._call("resetJointState", self._pusher, joint, value, 0.0)
 
     def _put(self, token: int, pose: Floats) -> None:
-        """Lay a token down, at rest; the engine asks where its centre of mass is."""
+        """Lay a token down, at rest; the engine takes the position of its centre of mass."""
         x, y, angle = np.asarray(pose).tolist()
         right, up = self._shift(token, angle)
         place = (x + right, y + up, 0.0)
@@ -159,7 +158,7 @@ class PushTable(Client):
         return np.array([x - right, y - up, angle])
 
     def _shift(self, token: int, angle: float) -> tuple[float, float]:
-        """From a token's centre of area to its centre of mass, as it lies."""
+        """From a token's centre of area to its centre of mass, at its present angle."""
         x, y = self._centres[token].tolist()
         cos, sin = math.cos(angle), math.sin(angle)
         return cos * x - sin * y, sin * x + cos * y
@@ -189,7 +188,7 @@ class PushTable(Client):
         return body
 
     def _make_finger(self, friction: float) -> int:
-        """A cylinder on three joints: x, y and height."""
+        """Make the finger: a cylinder on three joints, for x, y and height."""
         cylinder = self._call(
             "createCollisionShape",
             pybullet.GEOM_CYLINDER,

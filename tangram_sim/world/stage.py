@@ -1,4 +1,4 @@
-"""What an arm does, seen from the side.
+"""Pictures of an arm at work, seen from the side.
 
 Legend: K tokens, V corners.
 """
@@ -23,19 +23,19 @@ _TABLE, _PLACE = (0.97, 0.97, 0.95), (0.86, 0.78, 0.62)
 
 
 class Stage:
-    """A table, tokens, their places and a peg, where an arm is."""
+    """The visible scene around an arm: table, tokens, their target places and the peg."""
 
     def __init__(
         self, layout: Layout, arm: Panda, goals: Floats, present: Bools, finger: float
     ) -> None:
-        """Set it up.
+        """Add the scene to the client of the arm.
 
         Args:
             layout: the tokens.
-            arm: whose client shows it.
-            goals: (V, 2) corners of their places, arena units.
-            present: (K,) which are there.
-            finger: the peg's radius, arena units.
+            arm: the arm.
+            goals: (V, 2) corners of the target, arena units.
+            present: (K,) tokens that take part.
+            finger: radius of the peg, arena units.
         """
         self._layout, self._arm = layout, arm
         half = ENGINE_ARENA / 2.0 * METRES
@@ -52,7 +52,7 @@ class Stage:
         self._peg = self._body(self._shape(pybullet.GEOM_CYLINDER, (0.25, 0.25, 0.28), **peg))
 
     def seen(self, joints: Floats, tip: Floats, corners: Floats) -> Image.Image:
-        """A picture of a moment: joints (7,), the tip (3,) in metres, corners (V, 2)."""
+        """A picture of one moment: joints (7,), tip (3,) in metres, tokens' corners (V, 2)."""
         self._arm.at(joints.tolist())
         poses, (x, y, z) = self._layout.poses(corners), tip.tolist()
         for token, body in self._tokens.items():
@@ -67,7 +67,7 @@ class Stage:
     def _token(self, token: int, half: float, colour: tuple[float, ...]) -> int:
         corners = self._layout.shapes[token].corners * METRES
         vertices, triangles = prism(corners, half)
-        # Each triangle has corners of its own: shared ones would be shaded as if all were round.
+        # No two triangles share corners: shared ones would make the shading look round.
         mesh = {"vertices": [vertices[i] for i in triangles], "indices": [*range(len(triangles))]}
         return self._body(self._shape(pybullet.GEOM_MESH, colour, **mesh))
 

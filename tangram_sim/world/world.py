@@ -1,4 +1,4 @@
-"""One arena with K tokens, whatever moves them."""
+"""The interface of a world, checks of its settings, and the choice of its backend."""
 
 from importlib.util import find_spec
 from typing import Protocol
@@ -16,18 +16,18 @@ from tangram_sim.targets.targets import check_targets, sample_starts, sample_tar
 class World(Protocol):
     """K tokens on the plane, in a square arena around the origin.
 
-    Both backends keep this contract; one test module holds them to it. A token is carried
-    above the others and set down; with the engine, tokens that are set down in one place then push
-    each other apart. Nothing stops one at the arena's edge.
+    Both backends keep this contract, and one test module checks both. A token is carried above the
+    others and set down. With the engine, tokens that overlap then push each other apart. A token
+    may leave the arena.
     """
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
-        """Put every token at rest at its pose: (K, 3) of x, y (arena units) and angle (rad).
+        """Put every token at rest in a pose.
 
         Args:
-            poses: of the tokens.
-            flipped: (K,) which lie on their other side, see `Layout.corners`, chiral ones only;
-                None: none does.
+            poses: (K, 3) x, y (arena units) and angle (rad) of the tokens.
+            flipped: (K,) tokens that are turned over, chiral ones only, see `Layout.corners`; None:
+                no token is.
         """
 
     def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
@@ -35,29 +35,29 @@ class World(Protocol):
 
         Args:
             token: its index.
-            velocity: (3,) x, y in arena units a second; angular velocity about z in rad/s.
-            flip: turn it over in the air, about its body's x axis, before it moves; a chiral one.
+            velocity: (3,) x, y in arena units per second; angular velocity about z in rad/s.
+            flip: whether to turn it over about its body's x axis before it moves, if it is chiral.
         """
 
     def poses(self) -> Floats:
-        """(K, 3) x, y and angle in (-pi, pi]."""
+        """Poses (K, 3) of the tokens: x, y and angle in (-pi, pi]."""
 
     def flipped(self) -> Bools:
-        """(K,) which tokens lie on their other side."""
+        """(K,) which tokens are turned over."""
 
     def picture(self) -> Pixels:
-        """(P, P) grayscale picture of the tokens as they lie; see pictures.py."""
+        """Grayscale picture (P, P) of the tokens; see pictures.py."""
 
     def close(self) -> None:
-        """Free what the world holds; calling it twice does no harm."""
+        """Free the resources of the world; further calls do nothing."""
 
 
 def check_world(layout: Layout, sim: SimConfig) -> None:
-    """Refuse a task that no world could play, without making one.
+    """Check that a world can play a task, without making a world.
 
     Raises:
         SamplingError: see `check_room`.
-        ConfigError: the engine or OpenCV is needed and not installed, or see `check_targets`.
+        ConfigError: the engine or OpenCV is needed but not installed; see also `check_targets`.
     """
     check_room(layout, sim)
     if sim.backend == "physics" and find_spec("pybullet") is None:
@@ -67,10 +67,10 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
 
 
 def check_room(layout: Layout, sim: SimConfig) -> None:
-    """Refuse a task whose tokens have no room, also where nothing is played.
+    """Check that the tokens have room in the arena; this needs neither engine nor OpenCV.
 
     Raises:
-        SamplingError: a token does not fit into the arena, or not all tokens do.
+        SamplingError: a token does not fit into the arena, or not all tokens do together.
         ConfigError: see `check_targets`.
     """
     check_targets(layout, sim)
@@ -79,20 +79,20 @@ def check_room(layout: Layout, sim: SimConfig) -> None:
 
 
 def check_shown(sim: SimConfig, outlines: bool) -> None:
-    """Raise ConfigError, which says who takes silhouettes, for who knows nothing of outlines."""
+    """Raise ConfigError for `sim.observe=silhouette` if the agent does not take outlines."""
     if sim.observe == "silhouette" and not outlines:
         raise ConfigError(
             "sim.observe=silhouette is for an agent of outlines: train one with task=fill "
-            "agent=outline, or set sim.observe=corners; tangram-play silhouette= fills one"
+            "agent=outline, or set sim.observe=corners; tangram-play silhouette=FILE fills one"
         )
 
 
 def make_world(layout: Layout, sim: SimConfig) -> World:
-    """A world of the configured backend; ConfigError if the engine is not installed."""
+    """A world of the configured backend; ConfigError if its engine is not installed."""
     if sim.backend == "kinematic":
         return KinematicWorld(layout, sim)
     try:
-        # Only here: the master and machines without an engine must never load it.
+        # Imported here: the master and machines without an engine must never load it.
         from tangram_sim.world.physics import PhysicsWorld  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise _no_engine(str(error)) from error
@@ -100,7 +100,7 @@ def make_world(layout: Layout, sim: SimConfig) -> World:
 
 
 def no_opencv(why: str) -> ConfigError:
-    """What is raised where pictures are to be observed, and nothing can look at them."""
+    """The error for `sim.observe=pictures` without OpenCV; `why` is the reason in its text."""
     return ConfigError(
         f"sim.observe=pictures needs OpenCV ({why}): install opencv-python-headless, or set "
         "sim.observe=corners"

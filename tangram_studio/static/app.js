@@ -1,4 +1,4 @@
-// The page: its tabs, its connection, and what is said between a person and the agent.
+// The page: its tabs, its connection, and its messages to a person and to the server.
 
 import { Board, make, pathOf, tray } from "./board.js";
 import { Pen } from "./draw.js";
@@ -18,7 +18,7 @@ class Studio {
     this.board = new Board($("board"), tokens);
     this.pen = new Pen(this.board, side);
     this.area = area;
-    this.number = 0; // of what is asked for: answers to what was asked before are dropped
+    this.number = 0; // of the newest request: answers to older ones are dropped
     this.goal = null;
     this.over = true;
     this.name = "figure";
@@ -28,7 +28,7 @@ class Studio {
       reveal: (k) => { $("seen-pieces").children[k].style.display = ""; },
       next: () => this.send({ ask: "next" }),
     });
-    this.begun = 0; // moves of this figure that were shown, or begun to be
+    this.begun = 0; // moves of this figure whose showing has begun
     this.board.onMove = (move) => {
       this.begun += move.token !== null;
       this.want();
@@ -59,7 +59,7 @@ class Studio {
     this.socket.onclose = ({ code }) => this.closed(code);
   }
 
-  // What was asked for while nobody heard it, or was being laid.
+  // Send again a request that was lost, or go on with a figure that was being laid.
   resume() {
     this.banner("");
     this.begun = 0; // another session counts anew
@@ -76,10 +76,10 @@ class Studio {
       this.banner("Too many pages are open on this studio: close one, then load this page again.");
       return;
     }
-    // Whoever is refused at the door sees no more than a failed connection: ask in plain HTTP.
+    // A refused socket looks like a failed connection, so ask for the reason in plain HTTP.
     const door = await fetch("api/figures").catch(() => null);
     if (code === SHUT || door?.status === 403) {
-      this.banner("tangram-studio was started anew: open the address that it printed now.");
+      this.banner("tangram-studio was restarted: open the new address that it printed.");
       return;
     }
     this.banner("Lost the connection to tangram-studio: is it still running? Trying again.");
@@ -109,7 +109,7 @@ class Studio {
     else if (message.told === "filled") this.filled(message);
     else if (message.told === "move") this.moved(message);
     else if (message.told === "wait") {
-      this.say("The studio is busy; it goes on by itself.", false, `${message.ahead} before this one`);
+      this.say("The studio is busy; your request starts by itself.", false, `${message.ahead} before yours`);
     } else if (message.told === "refused") this.refused(message.why);
   }
 
@@ -122,7 +122,7 @@ class Studio {
 
   refused(why) {
     this.board.halt();
-    if (this.looking) this.clear(); // what was answered before is not the answer to this
+    if (this.looking) this.clear(); // the answer on the page is that to an older request
     this.looking = false;
     this.over = true;
     this.say(`That did not work: ${why}`, true);
@@ -158,13 +158,13 @@ class Studio {
     const hint = {
       library: "Choose a figure: the agent lays it.",
       solve: "Choose a figure, and lay it yourself.",
-      lay: "Lay a figure of the seven tans, then show it to the agent.",
+      lay: "Lay a figure with the seven tans, then show it to the agent.",
       draw: "Draw a figure on the table; when it is closed, the agent begins.",
       file: "Drop a picture on the table.",
     }[kind];
-    const mine = kind !== "library" && kind !== "file"; // the table is the person's
+    const mine = kind !== "library" && kind !== "file"; // the person uses the table
     if (!mine && this.board.mode === "play") {
-      if (this.over) this.say(hint); // what is being laid goes on
+      if (this.over) this.say(hint); // otherwise the agent goes on with its figure
       return;
     }
     clearTimeout(this.timer);
@@ -179,7 +179,7 @@ class Studio {
     if (mine) $("board").scrollIntoView({ block: "nearest" });
   }
 
-  // No figure is on the table.
+  // Take the figure off the table.
   clear() {
     this.goal = null;
     this.solving.answer = null;
@@ -188,7 +188,7 @@ class Studio {
     $("answer").hidden = true;
   }
 
-  // What a hand on the table does.
+  // Set the table's mode, which decides what the pointer does.
   table(mode) {
     this.board.mode = mode;
     this.board.choose(-1);
@@ -200,7 +200,7 @@ class Studio {
     this.pen.clear();
   }
 
-  // Something new is looked at: what was before is over.
+  // Begin with a new figure, and drop the one before.
   look(what) {
     clearTimeout(this.timer);
     this.dropping?.abort();
@@ -213,7 +213,7 @@ class Studio {
   }
 
   fill(what) {
-    this.look("it");
+    this.look("the figure");
     this.last = { ask: "fill", number: this.number, ...what };
     this.send(this.last);
   }
@@ -221,7 +221,7 @@ class Studio {
   fillDrawing() {
     const outline = this.pen.whole();
     if (!outline.length) {
-      this.say("Nothing is drawn yet: three corners are needed at least.", true);
+      this.say("Nothing is drawn yet: draw at least three corners.", true);
       return;
     }
     this.name = "drawing";
@@ -250,7 +250,7 @@ class Studio {
   measured(next) {
     const area = this.pen.area(next) / this.area;
     $("area").textContent = area
-      ? `Area: ${area.toFixed(2)} of the seven tans. Any size will do: it is scaled to 1.00.`
+      ? `Area: ${area.toFixed(2)} of the seven tans. Any size works: it will be scaled to 1.00.`
       : "";
   }
 
@@ -269,10 +269,10 @@ class Studio {
     $("seen-pieces").replaceChildren(...answer.pieces.map((piece, k) => make("polygon", {
       points: piece.map((point) => point.join(",")).join(" "), fill: this.board.tokens[k].colour,
     })));
-    const share = `Both share ${per_cent(answer.iou)} of the area of both together; red dashes are what you showed.`;
+    const share = `The red dashes are your figure; the overlap (IoU) is ${per_cent(answer.iou)}.`;
     $("told").textContent = answer.exact
-      ? `What it sees, and where the tans go: ${answer.how}.`
-      : `Seven tans do not fill it; this is the nearest figure that was found. ${share} ${answer.how}`;
+      ? `What the agent sees, and where the tans go: ${answer.how}.`
+      : `Seven tans do not fill it; this is the nearest figure found. ${share} ${answer.how}`;
     if (this.kind === "solve") {
       this.solving.begin(answer);
       return;
@@ -285,7 +285,7 @@ class Studio {
   race() {
     if (!this.solving.race()) return;
     for (const piece of $("seen-pieces").children) piece.style.display = "none";
-    $("told").textContent = "How far the agent is.";
+    $("told").textContent = "What the agent has laid so far.";
     $("answer").hidden = false;
     this.number += 1;
     this.send({ ask: "play", number: this.number, goal: this.goal, start: null, shown: 0, motion: "lift" });
@@ -298,7 +298,7 @@ class Studio {
     this.asking = true;
     this.over = false;
     if (!start) {
-      this.say("The agent lays it.");
+      this.say("The agent lays the figure.");
       this.begun = 0;
     }
     const [goal, shown, motion] = [this.goal, this.begun, $("motion").value];
@@ -316,7 +316,7 @@ class Studio {
     this.want();
   }
 
-  // Two moves lie ready, so that none is waited for.
+  // Ask for moves ahead, so that two are ready and nobody waits.
   want() {
     if (this.over || this.asking || this.board.queue.length > 1) return;
     this.asking = true;
@@ -329,32 +329,32 @@ class Studio {
     clearTimeout(this.timer);
     this.board.halt();
     if (!this.goal || this.looking) return;
-    this.number += 1; // what was asked for is no longer wanted
+    this.number += 1; // moves asked for are no longer wanted
     this.over = true;
     this.say("You moved a tan: the agent goes on from here.");
     if (done) this.timer = setTimeout(() => this.play(this.board.scene), byKey ? RESTART_MS : 0);
   }
 
   shown(move) {
-    const so_far = `covers ${per_cent(move.coverage)}, IoU ${move.iou.toFixed(3)}`;
+    const so_far = `The tans cover ${per_cent(move.coverage)} of the figure, IoU ${move.iou.toFixed(3)}.`;
     if (!move.over) {
-      const told = move.blocked ? "Others are in the way: it tries another tan." : "The agent lays it.";
-      this.say(told, false, `It ${so_far}.`);
+      const told = move.blocked ? "Other tans are in the way: the agent tries another one." : "The agent lays the figure.";
+      this.say(told, false, so_far);
     } else if (move.iou >= 0.95) {
-      this.say(this.exact ? "Solved!" : "Laid: the nearest figure of seven tans.", false, `It ${so_far}.`);
-    } else this.say("It can do no more.", false, `It ${so_far} of the figure.`);
+      this.say(this.exact ? "Solved!" : "Laid: the nearest figure of seven tans.", false, so_far);
+    } else this.say("The agent can do no more.", false, so_far);
   }
 
   // Files
 
   save(kind) {
     if (!this.goal) return;
-    this.say("The file is made …");
+    this.say("Making the file …");
     const tokens = kind === "json" ? this.goal : this.board.scene;
     this.send({ ask: "save", kind, tokens, name: this.name, shown: this.begun });
   }
 
-  // Where each tan lies, as it came with the answer.
+  // Save where each tan lies; the answer has it.
   solution() {
     this.saving = { kind: "solution.json", type: "application/json", name: this.name };
     this.file(new TextEncoder().encode(JSON.stringify(this.answer.solution, null, 1)));
@@ -375,8 +375,8 @@ class Studio {
       one.addEventListener("change", () => this.source(one.value));
     }
     const pens = {
-      polygon: "Click corner after corner, then the first again. By keyboard: Tab to the table, arrow keys, Space sets a corner, Enter closes.",
-      free: "Draw around the figure in one stroke. Lines need not be straight: the nearest figure of tans is found.",
+      polygon: "Click each corner, then the first one again. With keys: Tab to the table, arrows move, Space sets a corner, Enter closes the figure.",
+      free: "Draw the outline in one stroke. Lines need not be straight: the agent finds the nearest figure of tans.",
     };
     for (const one of document.querySelectorAll("[name=pen]")) {
       one.addEventListener("change", () => {

@@ -28,7 +28,7 @@ export class Board {
     this.holds = []; // polygons beside the tans that a tan snaps to
     this.queue = [];
     this.move = null;
-    this.ms = MOVE_MS; // that a move takes
+    this.ms = MOVE_MS; // duration of a move
     this.frames = { shown: 0, moves: 0, waited: 0 };
     this.onDrag = () => {}; // (done): a person takes a tan, or has let it go
     this.onMove = () => {}; // (move): its showing begins
@@ -91,7 +91,7 @@ export class Board {
     this.wanted.setAttribute("d", pathOf(wanted));
   }
 
-  // Moves that the agent makes
+  // Moves of the agent
 
   add(move) {
     this.queue.push(move);
@@ -136,7 +136,7 @@ export class Board {
     const first = Math.max(0, Math.min(Math.floor(at), frames.length - 2));
     const [here, there] = [frames[first], frames[Math.min(first + 1, frames.length - 1)]];
     this.poses = here.map(([x, y, angle], k) => {
-      // What is carried leaves the others alone until it is set down.
+      // A carried tan leaves the others alone until it is set down.
       const part = lifts && k !== token ? (share < 1 ? 0 : 1) : at - first;
       const [tx, ty, turned] = there[k];
       return [x + part * (tx - x), y + part * (ty - y), angle + part * wrapped(turned - angle)];
@@ -156,7 +156,7 @@ export class Board {
     this.draw();
   }
 
-  // What a person does
+  // Actions of a person
 
   choose(k) {
     this.chosen = k;
@@ -164,7 +164,7 @@ export class Board {
   }
 
   raise(k) {
-    // Only where it matters: a tan that is put elsewhere loses the focus.
+    // Only if needed: an element that is moved in the document loses the focus.
     if (this.ink.previousSibling === this.tans[k]) return;
     const had = document.activeElement === this.tans[k];
     this.table.insertBefore(this.tans[k], this.ink);
@@ -248,7 +248,7 @@ export class Board {
     });
   }
 
-  // Move a tan by the least way that lays a corner onto a corner of another, or onto its edge.
+  // Move a tan by the shortest way that lays a corner onto another tan's corner or edge.
   snap(k, reach = SNAP) {
     let best = null;
     const offer = (dx, dy, cost) => {
@@ -277,7 +277,7 @@ export class Board {
   }
 }
 
-// Where the tans lie before anything is played: around the table's middle.
+// The tans' places before a game: around the middle of the table.
 export const tray = (tokens) => ({
   poses: tokens.map((_, k) => {
     const angle = Math.PI / 2 - (2 * Math.PI * k) / tokens.length;

@@ -1,11 +1,11 @@
-// Drawing a silhouette on the table: corner by corner with snapping, or by a free hand.
+// Drawing a silhouette on the table: corner by corner with snapping, or freehand.
 
 import { make, pathOf } from "./board.js";
 
 const NEAR = 0.06; // arena units within which a corner snaps
-const CLOSE = 0.05; // to the first corner, which closes the outline
-const POINT = 0.012; // between points of a free hand
-const KEY = 0.05;
+const CLOSE = 0.05; // within this of the first corner, a click closes the outline
+const POINT = 0.012; // between points of a freehand line, at least
+const KEY = 0.05; // that an arrow key moves
 const MOST = 1500; // points of an outline
 
 const far = ([ax, ay], [bx, by]) => Math.hypot(ax - bx, ay - by);
@@ -15,17 +15,17 @@ const areaOf = (ring) => Math.abs(ring.reduce((sum, [x, y], i) => {
 }, 0));
 
 export class Pen {
-  // `side`: of the full square that the tans are cut from.
+  // `side`: side of the full square that the tans are cut from.
   constructor(board, side) {
     this.board = board;
     this.kind = "polygon";
     this.snaps = true;
-    this.ring = []; // the outline that was closed
-    this.line = []; // the one that is being drawn
-    this.spot = null; // where the keyboard is
+    this.ring = []; // the closed outline
+    this.line = []; // the outline that is being drawn
+    this.spot = null; // the cursor of the keyboard
     this.onChange = () => {};
     this.onEnd = () => {}; // an outline is closed
-    this.again = () => false; // (event): whether another drawing begins
+    this.again = () => false; // (event): whether a new drawing begins
     const lengths = [];
     for (let a = 0; a <= 4; a += 1) {
       for (let b = 0; b <= 4; b += 1) {
@@ -58,7 +58,7 @@ export class Pen {
     this.draw();
   }
 
-  // The corner that a point is taken for.
+  // The corner that a point snaps to.
   snapped(point) {
     if (!this.snaps || !this.line.length) return point;
     if (this.line.length > 2 && far(point, this.line[0]) < CLOSE) return this.line[0];
@@ -97,7 +97,7 @@ export class Pen {
       return;
     }
     if (this.line.length && far(there, this.line.at(-1)) < 1e-6) return;
-    this.ring = []; // another begins
+    this.ring = []; // a new outline begins
     if (this.line.length < MOST) this.line.push(there);
     this.spot = there;
     this.draw();
@@ -127,7 +127,7 @@ export class Pen {
     if (this.line.length > 2) this.onEnd();
   }
 
-  // What is drawn, closed: where another corner is set, another outline begins.
+  // The drawing as a closed outline; the next corner begins a new one.
   whole() {
     if (this.line.length > 2) {
       this.ring = this.line;

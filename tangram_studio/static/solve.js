@@ -1,17 +1,17 @@
-// A person lays a figure: time is taken, a hint lays one tan, and the agent may race.
+// A person lays a figure against the clock. A hint lays one tan, and the agent may race.
 
 import { MOVE_MS, pathOf, tray } from "./board.js";
 
-const PIXELS = 240; // along the table, in which figure and tans are compared
-const SOLVED = 0.95; // of the area of both together, as everywhere
-const NEAR = 0.03; // a tan this near to where the answer has it lies there
+const PIXELS = 240; // along the table, to compare figure and tans
+const SOLVED = 0.95; // IoU of tans and figure, as everywhere
+const NEAR = 0.03; // arena units: corners so near to their place in the answer count as there
 const OVER = 0.03; // of the tans' area that may lie on other tans
 
 const CHOOSE = "Choose a figure first.";
 const clock = (ms) => `${Math.floor(ms / 60_000)}:${String(Math.floor(ms / 1000) % 60).padStart(2, "0")}`;
 
 export class Solving {
-  // `say` tells a line, `reveal(k)` shows where the answer has a tan, `next` asks for the agent's next move.
+  // `say` shows a line, `reveal(k)` shows a tan of the answer, `next` asks for the agent's next move.
   constructor(board, { say, reveal, next }) {
     Object.assign(this, { board, say, reveal, next, solved: false, racing: false });
     this.canvas = new OffscreenCanvas(PIXELS, PIXELS);
@@ -32,7 +32,7 @@ export class Solving {
     this.say("Drag the tans onto the figure. R turns a tan, F turns the parallelogram over.");
   }
 
-  // What was laid so far; a person has let go of a tan.
+  // Check whether the figure is solved, after a person has let go of a tan.
   look() {
     if (!this.answer || this.solved) return;
     const { iou, twice } = this.compared();
@@ -44,33 +44,33 @@ export class Solving {
     }
   }
 
-  // One tan that does not lie as the answer has it is laid there.
+  // Lay one tan, that is not in its place yet, where the answer has it.
   hint() {
     if (!this.answer || this.solved) {
-      this.say(this.solved ? "It is solved." : CHOOSE);
+      this.say(this.solved ? "The figure is solved already." : CHOOSE);
       return;
     }
     const { poses, flipped } = this.answer.goal;
     const k = poses.findIndex((_, i) => !this.lies(i, i) && !this.taken(i));
     if (k < 0) {
-      this.say("Every tan lies where one may.");
+      this.say("All tans are in their places.");
       return;
     }
     this.board.poses[k] = [...poses[k]];
     this.board.flipped[k] = flipped[k];
     this.board.raise(k);
     this.board.draw();
-    this.say(`The ${this.board.tokens[k].name.replaceAll("_", " ")} is laid.`);
+    this.say(`The ${this.board.tokens[k].name.replaceAll("_", " ")} is laid in its place.`);
     this.look();
   }
 
-  // Whether another tan of the shape lies in a tan's place already.
+  // Whether another tan of the same shape lies in a tan's place already.
   taken(k) {
     const alike = (token) => token.name === this.board.tokens[k].name;
     return this.board.tokens.some((token, other) => other !== k && alike(token) && this.lies(other, k));
   }
 
-  // Whether a tan lies in the place of another, or its own: each corner near to one.
+  // Whether a tan lies in a place, its own or another's: each corner is near to one of the place.
   lies(own, place) {
     const { poses, flipped } = this.answer.goal;
     const wanted = this.board.corners(place, poses[place], flipped[place]);
@@ -85,11 +85,11 @@ export class Solving {
     }
     this.again();
     this.racing = true;
-    this.say("The agent has begun, in the small picture.");
+    this.say("The agent has begun: watch it in the small picture.");
     return true;
   }
 
-  // A move of the agent in a race: it takes as long as on the table.
+  // Show a move of the agent in a race; it takes as long as on the table.
   raced(move) {
     const own = this.begun;
     setTimeout(() => {
@@ -105,7 +105,7 @@ export class Solving {
     }, move.token === null ? 0 : MOVE_MS);
   }
 
-  // Shared area over that of both, and the share of the tans that lies on others.
+  // IoU of tans and figure, and the share of the tans' area that lies on other tans.
   compared() {
     const draw = (paths) => {
       const context = this.canvas.getContext("2d", { willReadFrequently: true });

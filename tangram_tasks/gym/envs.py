@@ -23,7 +23,7 @@ Seen = dict[str, Array]
 
 
 class GymEnv(Env):
-    """B environments, one after the other; one that terminates plays on."""
+    """B environments, stepped one after the other; a terminated one plays on."""
 
     def __init__(self, judge: Judge, config: GymConfig, count: int) -> None:
         self.count = count
@@ -33,7 +33,7 @@ class GymEnv(Env):
         self._desired: Array = np.zeros((count, 0))
 
     def reset(self, generators: Generators) -> Arrays:
-        """Begin episodes whose seeds are the first number of their generators."""
+        """Begin an episode in each environment, seeded by a number from its generator."""
         if self._config.fresh:
             self.close()
             self._envs = [self._judge.make() for _ in range(self.count)]
@@ -41,17 +41,17 @@ class GymEnv(Env):
         for i, (env, generator) in enumerate(zip(self._envs, generators, strict=True)):
             own, info = env.reset(seed=int(generator.integers(2**31)))
             seen.append(own)
-            self._success[i] = bool(succeeded(info))  # Fetch does not tell it yet: no
+            self._success[i] = bool(succeeded(info))  # Fetch reports no success at reset: False
         together = _stacked(seen)
         self._desired = together[DESIRED]
         return _singles(together)
 
     def step(self, actions: Singles) -> Step:
-        """What each environment gave; reward and end are those of goals in float32.
+        """Play actions (B, A); rewards and terminations are computed from float32 goals.
 
         Raises:
-            ConfigError: it ends where its goals do not tell it.
-            RunError: its goal moved.
+            ConfigError: an environment terminates where its goals say otherwise.
+            RunError: a desired goal moved within an episode.
         """
         seen, ended = [], np.zeros(self.count, bool)
         for i, (env, action) in enumerate(
@@ -64,7 +64,7 @@ class GymEnv(Env):
         if not np.array_equal(together[DESIRED], self._desired):
             raise RunError(
                 f"task.id={self._config.id}: its desired goal moved within an episode, which "
-                "hindsight cannot follow: play an environment whose goals stay"
+                "hindsight cannot follow: choose an environment whose goals stay fixed"
             )
         self._check_ends(together, ended)
         singles = _singles(together)
@@ -72,21 +72,21 @@ class GymEnv(Env):
         return Step(singles, self._judge.rewards(*goals), self._judge.ended(*goals))
 
     def facts(self) -> Arrays:
-        """Whether each is a success now, as the environment says."""
+        """(B,) whether each environment reports success now."""
         return {SUCCESS: self._success.copy()}
 
     def told(self) -> Json:
-        """Whether the first is a success, as it says: it may never terminate."""
+        """Whether the first environment reports success; it may do so without termination."""
         return {"is_success": bool(self._success[0])}
 
     def close(self) -> None:
-        """Close all."""
+        """Close all environments."""
         for env in self._envs:
             env.close()
         self._envs = []
 
     def _check_ends(self, seen: Seen, ended: Bools) -> None:
-        """By goals in the environment's own precision."""
+        """Raise ConfigError if an end differs from that by goals in their own precision."""
         if not self._config.ends:
             return
         wrong = ended != self._judge.ended(seen[ACHIEVED], seen[DESIRED])
@@ -94,12 +94,12 @@ class GymEnv(Env):
             what = "terminated" if ended[wrong][0] else "did not terminate"
             raise ConfigError(
                 f"task.id={self._config.id} {what} where its goals say otherwise, so hindsight "
-                "cannot tell what ends for another goal: set task.ends=false"
+                "cannot tell where an episode ends for another goal: set task.ends=false"
             )
 
 
 def _stacked(seen: list[Seen]) -> Seen:
-    """What B environments show, in one, in their own precision."""
+    """Observations of B environments stacked by name, in their own precision."""
     names = OBSERVATION, ACHIEVED, DESIRED
     return {name: np.stack([one[name] for one in seen]) for name in names}
 

@@ -1,4 +1,4 @@
-"""One environment: what its episodes are made of, what steps are worth, what cannot be learned.
+"""Inspection of one environment: spec, rewards, terminations, and whether it can be learned.
 
 Legend: n rows, G entries of a goal, A entries of an action.
 """
@@ -21,30 +21,30 @@ from tangram_core.spec import MAX_REWARD, Array, EpisodeSpec, Field
 from tangram_tasks.gym.task import SUCCESS, GymConfig
 
 OBSERVATION, ACHIEVED, DESIRED = "observation", "achieved_goal", "desired_goal"
-MOST = 1e6  # of a number that is observed: only what is wrong lies beyond
-FAR = 1e3  # of an entry of a goal: further than anything comes, if its space has no bounds
-TRIED = 10  # random steps by which an environment is looked at
+MOST = 1e6  # largest observed number; only errors lie beyond
+FAR = 1e3  # entry of a goal that is tried where its space has no bounds
+TRIED = 10  # random steps that are played for inspection
 Environment = gymnasium.Env[Any, Any]
 
 
 class Judge:
-    """Makes environments of one kind, and judges steps by one of them.
+    """Makes environments of one id; one of them computes rewards and terminations.
 
     Attributes:
-        spec: what the episodes are made of.
+        spec: names, shapes and bounds of the arrays in an episode.
         low, high: (A,) bounds of the environment's own actions.
     """
 
     def __init__(self, config: GymConfig) -> None:
-        """Make one and look at it.
+        """Make one environment and inspect it.
 
         Raises:
-            ConfigError: it cannot be made, or cannot be learned; names the remedy.
+            ConfigError: the environment cannot be made or learned; the text names a remedy.
         """
         self._config = config
         self._horizon = self._registered()
         self.env = self.make()
-        weakref.finalize(self, self.env.close)  # engines complain at exit of what is left open
+        weakref.finalize(self, self.env.close)  # engines complain at exit if left open
         sizes = {name: self._box(name).shape[0] for name in (OBSERVATION, ACHIEVED, DESIRED)}
         if sizes[ACHIEVED] != sizes[DESIRED]:
             self._refuse("its achieved and desired goals differ in size")
@@ -64,7 +64,11 @@ class Judge:
         )
 
     def make(self) -> Environment:
-        """A new environment, without its time limit."""
+        """Make a new environment without a time limit.
+
+        Raises:
+            ConfigError: the environment's own code fails, for example for lack of a package.
+        """
         try:
             with _quiet():
                 return gymnasium.make(
@@ -73,24 +77,24 @@ class Judge:
         except Exception as error:  # whatever the environment's own code raises
             why = f"{type(error).__name__}: {error}".strip().splitlines()[0]
             raise ConfigError(
-                f"task.id={self._config.id} cannot be made ({why}): install what it needs, for "
-                "Fetch and Panda: pip install gymnasium-robotics 'mujoco<3.12' panda-gym"
+                f"task.id={self._config.id} cannot be made ({why}): install its packages; "
+                "for Fetch and Panda: pip install gymnasium-robotics 'mujoco<3.12' panda-gym"
             ) from error
 
     def scaled(self, actions: Singles) -> Singles:
-        """Actions of the environment (B, A), from those of [-1, 1]; never beyond by a rounding."""
+        """Scale actions (B, A) from [-1, 1] to the action space; rounding stays within bounds."""
         scaled = self.low + (actions + 1.0) * 0.5 * (self.high - self.low)
         return np.clip(scaled, self.low, self.high)
 
     def rewards(self, achieved: Array, desired: Array) -> Floats:
-        """(n,) of goals (n, G)."""
+        """Rewards (n,) of achieved and desired goals (n, G)."""
         return np.asarray(self._compute(achieved, desired, {}), np.float64)
 
     def ended(self, achieved: Array, desired: Array) -> Bools:
-        """(n,) whether steps that came to goals (n, G) terminate for others.
+        """(n,) whether steps with achieved goals (n, G) terminate for desired goals (n, G).
 
-        By `compute_terminated`, as gymnasium-robotics has it. What has none is taken to end where
-        its reward is that of a goal that is reached, as Panda's do: `GymEnv` checks it.
+        Calls `compute_terminated`, as in gymnasium-robotics. Without that method, a step terminates
+        where its reward is that of a reached goal, as in Panda; `GymEnv` checks this.
         """
         if not self._config.ends:
             return np.zeros(len(achieved), bool)
@@ -104,7 +108,7 @@ class Judge:
         found = np.asarray(self._terminated(achieved, desired, {}), bool)
         if found.shape == (len(achieved),):
             return found
-        # One word for all: that none ends is believed.
+        # One value for all rows: False is trusted, True is checked row by row.
         none = np.zeros(len(achieved), bool)
         return self._one_by_one(achieved, desired) if found.any() else none
 
@@ -113,12 +117,12 @@ class Judge:
         return np.fromiter((self._terminated(*row, {}) for row in rows), bool, len(achieved))
 
     def repeats(self) -> bool:
-        """Whether an episode is the same again after another one."""
+        """Whether an episode repeats exactly after another episode was played."""
         first, _, again = (self._played(seed) for seed in (0, 1, 0))
         return np.array_equal(first, again)
 
     def _played(self, seed: int) -> Floats:
-        """What is observed in an episode of random actions."""
+        """Observations in an episode of random actions."""
         rng = np.random.default_rng(seed)
         observed = [self.env.reset(seed=seed)[0][OBSERVATION]]
         for _ in range(self._horizon):
@@ -127,7 +131,7 @@ class Judge:
         return np.array(observed)
 
     def _registered(self) -> int:
-        """Steps of an episode."""
+        """Import the modules of task.imports; returns the registered steps of an episode."""
         config = self._config
         if not config.id:
             raise ConfigError("task.id must name an environment, got '': set task.id=FetchReach-v4")
@@ -138,45 +142,45 @@ class Judge:
                     importlib.import_module(module)
             except Exception as error:  # whatever its code raises
                 raise ConfigError(
-                    f"task.imports: cannot import {module} ({error}): install its package, for "
-                    "gymnasium_robotics and panda_gym: pip install gymnasium-robotics "
+                    f"task.imports: cannot import {module} ({error}): install its package; "
+                    "for gymnasium_robotics and panda_gym: pip install gymnasium-robotics "
                     "'mujoco<3.12' panda-gym"
                 ) from error
         try:
             horizon = gymnasium.spec(config.id).max_episode_steps
         except gymnasium.error.Error as error:
             raise ConfigError(
-                f"task.id={config.id} is not registered: mend it, or add the module that registers "
-                "it to task.imports, such as panda_gym"
+                f"task.id={config.id} is not registered: correct the id, or add to task.imports "
+                "the module that registers it, such as panda_gym"
             ) from error
         if not horizon:
             self._refuse("it has no time limit: register it with max_episode_steps")
         return horizon
 
     def _box(self, name: str) -> spaces.Box:
-        """The space of a part of what is observed."""
+        """The space of one entry of the observation."""
         space = self.env.observation_space
         part = space.get(name) if isinstance(space, spaces.Dict) else None
         if part is None:
-            self._refuse(f"what it observes is no dict with {name}: it is no goal environment")
+            self._refuse(f"its observation is no dict with {name}: choose a goal environment")
         if not isinstance(part, spaces.Box) or len(part.shape) != 1 or part.dtype == np.uint8:
-            self._refuse(f"its {name} is {part}, and must be a list of numbers; pictures are none")
+            self._refuse(f"its {name} is {part}, and must be a vector of numbers, no picture")
         return part
 
     def _action_bounds(self) -> tuple[Singles, Singles]:
         space = self.env.action_space
         if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
-            self._refuse(f"its actions are {space}, and must be a bounded list of numbers")
+            self._refuse(f"its actions are {space}, and must be a bounded vector of numbers")
         return space.low.astype(np.float32), space.high.astype(np.float32)
 
     def _method(self, name: str) -> Any:
         """A method of the environment, or of a wrapper that it was registered with."""
         if not self.env.has_wrapper_attr(name):
-            self._refuse(f"it has no {name}: it is no goal environment")
+            self._refuse(f"it has no {name}: choose a goal environment")
         return self.env.get_wrapper_attr(name)
 
     def _look(self) -> Floats:
-        """Play a few random steps, and compare what they pay with what is computed of the goals."""
+        """Play a few random steps, and compare their rewards with those computed from the goals."""
         rng = np.random.default_rng(0)
         seen, _ = self.env.reset(seed=0)
         achieved, desired, paid = [seen[ACHIEVED]], seen[DESIRED], []
@@ -184,16 +188,16 @@ class Judge:
             action = self.scaled(rng.uniform(-1, 1, len(self.low)).astype(np.float32))
             seen, reward, _, _, info = self.env.step(action)
             if succeeded(info) is None:
-                self._refuse(f"its info lacks {SUCCESS}, which its score is made of")
+                self._refuse(f"its info lacks {SUCCESS}, which the scores need: add it in step")
             achieved.append(seen[ACHIEVED])
             paid.append(float(reward))
-        # The last rows lie where no play of a few steps comes to.
+        # The last rows are goals that a few random steps do not reach.
         space, far = self._box(ACHIEVED), rng.choice([-FAR, FAR], (TRIED, len(desired)))
         A = np.concatenate([[desired], achieved, achieved, far.clip(space.low, space.high)])
         D = np.concatenate([[desired] * (1 + len(achieved)), achieved[::-1], [desired] * TRIED])
         found = self._whole(A, D)
         if not np.allclose(found[2 : 1 + len(achieved)], paid, rtol=1e-4, atol=1e-6):
-            self._refuse("its steps do not pay what compute_reward says of the goals alone")
+            self._refuse("its step rewards differ from compute_reward of the goals alone")
         self._best = float(found[0])
         self._ended: Callable[[Array, Array], Bools] = self._at_best
         if self.env.has_wrapper_attr("compute_terminated"):
@@ -202,9 +206,9 @@ class Judge:
         return found
 
     def _takes_arrays(self, achieved: Array, desired: Array) -> bool:
-        """Whether `compute_terminated` says the same of arrays as of each row.
+        """Whether `compute_terminated` gives the same for arrays as for each row.
 
-        A thousand calls would take longer than an update.
+        If not, each row takes a call, and a thousand calls take longer than an update.
         """
         try:
             found = self._at_once(achieved, desired)
@@ -213,7 +217,7 @@ class Judge:
         return bool((found == self._one_by_one(achieved, desired)).all())
 
     def _whole(self, achieved: Array, desired: Array) -> Floats:
-        """(n,) rewards of arrays, which must be those of each row."""
+        """Rewards (n,) of arrays of goals; refused if single rows give others."""
         rows, why = zip(achieved, desired, strict=True), ""
         try:
             found = self.rewards(achieved, desired)
@@ -233,14 +237,14 @@ class Judge:
 
 
 def succeeded(info: Mapping[str, Any]) -> bool | None:
-    """Whether a step is a success; None: not told. Mazes of gymnasium-robotics say `success`."""
+    """Whether `info` reports success, by `is_success` or `success`; None if it has neither."""
     found = info.get(SUCCESS, info.get("success"))
     return None if found is None else bool(found)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Send nowhere what engines written in C tell of themselves: sys.stdout is not asked by it."""
+    """Discard what engines written in C print: they do not use sys.stdout or sys.stderr."""
     try:
         kept = {number: os.dup(number) for number in (1, 2)}
     except OSError:  # this process has none

@@ -1,4 +1,4 @@
-"""Environments with the goal interface of gymnasium, as a task.
+"""Task `gym`: an environment with the goal interface of gymnasium.
 
 Legend: E episodes, T steps of an episode, n rows, A entries of an action.
 """
@@ -19,32 +19,32 @@ from tangram_core.task import Env, Json, Played, Purpose, Task
 if TYPE_CHECKING:  # the judge loads gymnasium
     from tangram_tasks.gym.judge import Judge
 
-SUCCESS = "is_success"  # in gymnasium's info, and in the facts of a moment
+SUCCESS = "is_success"  # key in gymnasium's info and in `Env.facts`
 
 
 @dataclass(frozen=True)
 class GymConfig(Settings, section="task"):
-    """Which environment of gymnasium is played."""
+    """The environment of gymnasium that is played, and how its episodes end and begin."""
 
     id: str = setting("", "the environment's id at gymnasium, such as FetchReach-v4", part=NETWORK)
     imports: tuple[str, ...] = setting(
         (),
-        "modules to import first, which register environments: gymnasium_robotics, panda_gym",
+        "modules that register environments, imported first: gymnasium_robotics, panda_gym",
         part=NETWORK,
     )
     ends: bool = setting(
         True,
-        "whether a step that terminates ends what counts; false: as if nothing ever terminated",
+        "true: an episode counts up to the step that terminates; false: termination is ignored",
     )
     fresh: bool = setting(
         False,
-        "make each environment anew for each episode: slow, and exact where an episode depends on "
-        "the one before it, as PandaPush-v3 does",
+        "make a new environment for each episode: slow, but exact where episodes depend on the one "
+        "before, as in PandaPush-v3",
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if ":" in self.id:  # gymnasium would import what stands before it
+        if ":" in self.id:  # gymnasium would import the module before the colon
             module, _, name = self.id.partition(":")
             raise ConfigError(
                 f"task.id must not have a colon, got '{self.id}': "
@@ -54,12 +54,12 @@ class GymConfig(Settings, section="task"):
 
 @dataclass(frozen=True)
 class Gym(Task):
-    """An environment whose observation is a dict of observation, achieved_goal and desired_goal.
+    """An environment that observes a dict of observation, achieved_goal and desired_goal.
 
-    Every field is float32 within +-1e6, whatever its space says: PandaPush-v3 says 10 and reaches
-    50. What an action of [-1, 1] does is scaled to the action space. Its `compute_reward` is what a
-    step pays, of goals rounded to float32, so that the master comes to the same reward. The master
-    makes one environment for it, the first time that the spec or a reward is asked for.
+    Every field is float32 within +-1e6. The bounds of the environment's own spaces are not used:
+    PandaPush-v3 declares 10 and reaches 50. Actions in [-1, 1] are scaled to the action space. The
+    reward of a step is `compute_reward` of goals rounded to float32, so that the master computes
+    the same. The master makes one environment when spec or rewards are first needed.
     """
 
     sections: ClassVar = {"task": GymConfig}
@@ -73,10 +73,10 @@ class Gym(Task):
 
     @cached_property
     def judge(self) -> "Judge":
-        """One environment, of which spec and rewards come; made when it is asked for first.
+        """The environment that gives spec and rewards, made at the first use.
 
         Raises:
-            ConfigError: it cannot be made, or cannot be learned.
+            ConfigError: the environment cannot be made or cannot be learned.
         """
         from tangram_tasks.gym.judge import Judge  # noqa: PLC0415
 
@@ -84,11 +84,11 @@ class Gym(Task):
 
     @property
     def spec(self) -> EpisodeSpec:
-        """What the environment's spaces and its registered time limit say."""
+        """Horizon and fields, from the environment's registered time limit and its spaces."""
         return self.judge.spec
 
     def check(self, *, plays: bool) -> None:  # noqa: ARG002
-        """Refuse what is no environment with goals, or is not installed: the master needs it too.
+        """Refuse an environment without goals or not installed; the master needs it, too.
 
         Raises:
             ConfigError: names the setting and the remedy.
@@ -96,33 +96,33 @@ class Gym(Task):
         self.judge  # noqa: B018
 
     def check_exact(self) -> None:
-        """Refuse an environment that plays otherwise after another episode, unless made anew."""
+        """Raise ConfigError if episodes depend on earlier ones, unless `fresh` is set."""
         if not (self.config.fresh or self.judge.repeats()):
             raise ConfigError(
-                f"service.mode=lockstep, and task.id={self.config.id} plays an episode otherwise "
-                "after another one: set task.fresh=true"
+                f"service.mode=lockstep needs repeatable episodes, and episodes of "
+                f"task.id={self.config.id} depend on earlier ones: set task.fresh=true"
             )
 
     def rewards(self, achieved: Array, desired: Array) -> Floats:
-        """(n,) what the environment's own `compute_reward` says."""
+        """Rewards (n,) by the environment's own `compute_reward`."""
         return self.judge.rewards(achieved, desired)
 
     def ended(self, achieved: Array, desired: Array, recorded: Bools) -> Bools:  # noqa: ARG002
-        """(n,) whether it would terminate, by these goals alone."""
+        """(n,) whether steps terminate, computed from the goals alone."""
         return self.judge.ended(achieved, desired)
 
     def make(self, count: int, purpose: Purpose = "play") -> Env:  # noqa: ARG002
-        """So many environments in this process.
+        """Make `count` environments in this process.
 
         Raises:
-            ConfigError: they cannot be made.
+            ConfigError: an environment cannot be made.
         """
         from tangram_tasks.gym.envs import GymEnv  # noqa: PLC0415
 
         return GymEnv(self.judge, self.config, count)
 
     def score(self, played: Played) -> dict[str, float]:
-        """Success where an episode ends: where it terminates first, else at its last step."""
+        """Compute the scores; an episode ends where it first terminates, else at its last step."""
         terminated = played.episodes.terminated.astype(bool)
         horizon = terminated.shape[1]
         success = played.facts[SUCCESS][:, 1:].astype(bool)  # (E, T) after each step
@@ -137,5 +137,5 @@ class Gym(Task):
         }
 
     def facts(self) -> Json:
-        """Its id."""
+        """The environment's id, for result.json."""
         return {"task": self.config.id}

@@ -1,5 +1,5 @@
-"""A finger pushes tokens into place on a table whose friction nobody is told.
+"""A finger pushes tokens into place on a table with hidden friction.
 
-`task.py` says what is played and what it is worth, `places.py` what a push is, `env.py` plays, and
-the others learned nothing. The engine is `tangram_sim.world.pushing`.
+`task.py` has settings, rewards and scores, `places.py` defines a push, `env.py` simulates tables,
+and `rivals.py` has the baselines. The engine is `tangram_sim.world.pushing`.
 """

@@ -1,7 +1,7 @@
-"""What pushes do to a token that lies alone, and how many it then needs.
+"""Effects of random pushes on a token that lies alone, and how many pushes such a token needs.
 
-Random pushes of each shape are tried in an engine, at the middle of what is unknown. From these
-value iteration computes how many are needed, on a grid that is fine where little is left to go.
+Random pushes of each shape are simulated, with hidden parameters at the middle of their ranges.
+Value iteration then computes how many pushes are needed, on a grid that is finest near the goal.
 
 Legend: N pushes of a shape, G points of the grid, n rows.
 """
@@ -18,18 +18,18 @@ from tangram_sim.geometry.shapes import Shape
 from tangram_sim.world.pushing import PushTable, Unknowns
 from tangram_tasks.push.places import push_of
 
-PUSHES, FEW = 1024, 512  # of each shape; and those of them that value iteration chooses from
-GRID, FAR, SWEEPS = (21, 21, 17), 2.9, 12  # x, y and turn that are left; the most of x and y
+PUSHES, FEW = 1024, 512  # random pushes of each shape; the first of them, for value iteration
+GRID, FAR, SWEEPS = (21, 21, 17), 2.9, 12  # points in x, y and turn; largest x and y; sweeps
 
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """What random pushes do to a shape that lies alone.
+    """Random pushes of a shape that lies alone, and their effects.
 
     Attributes:
-        actions: (N, 3) where, turn, far.
-        moved: (N, 3) x, y and turn of the token in its own frame.
-        begins, ends: (N, 2) of the finger, there.
+        actions: (N, 3) place on the edge, direction and length, in [-1, 1]; see `ways_of`.
+        moved: (N, 3) x, y and turn by which the token moved, in its own frame.
+        begins, ends: (N, 2) points of the finger, in the same frame.
     """
 
     actions: Floats
@@ -39,36 +39,36 @@ class Pushes:
 
 
 def way_left(poses: AnyArray, desired: AnyArray) -> Floats:
-    """(..., 3) from poses (..., 3) to others, in the frames of the first."""
+    """Remaining ways (..., 3) from poses (..., 3) to desired ones, in the frames of the poses."""
     way = (desired[..., :2] - poses[..., :2]) @ (1.0, 1j) * np.exp(-1j * poses[..., 2])
     return np.stack([way.real, way.imag, desired[..., 2] - poses[..., 2]], axis=-1)
 
 
 def after(ways: AnyArray, moved: AnyArray) -> Floats:
-    """(..., 3) ways that are left, in the frames of tokens that moved by (..., 3) in theirs."""
+    """Remaining ways (..., 3) after motions (..., 3), all in the tokens' own frames."""
     return way_left(moved, ways)
 
 
 def moved_by(poses: Floats, moved: Floats) -> Floats:
-    """(..., 3) poses after tokens moved by (..., 3) in their own frames."""
+    """Poses (..., 3) after tokens moved by (..., 3) in their own frames."""
     way = moved[..., :2] @ (1.0, 1j) * np.exp(1j * poses[..., 2])
     there: Floats = poses + np.stack([way.real, way.imag, moved[..., 2]], axis=-1)
     return there
 
 
 class Left:
-    """How many pushes a token that lies alone needs."""
+    """Number of pushes that a token needs if it lies alone, by value iteration."""
 
     def __init__(
         self, pushes: Pushes, period: float, within: float, turned: float, margin: float
     ) -> None:
-        """Iterate; some seconds.
+        """Run value iteration, which takes some seconds.
 
         Args:
-            pushes: to choose from.
-            period: turn that comes to the same.
-            within, turned: tolerances of a token that is in place.
-            margin: cost of one that is as far away as it may be: friction may add to it.
+            pushes: the pushes to choose from.
+            period: turn after which the shape looks the same, in radians.
+            within, turned: tolerances of distance and turn of a token in place.
+            margin: cost of a token just within tolerance: other friction may leave it outside.
         """
         self._period, self._margin, self._scale = period, margin, np.array([within, within, turned])
         self._most = np.arcsinh([FAR, FAR, period / 2.0] / self._scale)
@@ -83,16 +83,16 @@ class Left:
             self._counts = 1.0 + found.min(axis=1).reshape(GRID)
 
     def __call__(self, ways: Floats) -> Floats:
-        """(...) of ways that are left (..., 3); in place below 1, the less the nearer."""
+        """Number of pushes (...) for remaining ways (..., 3); below 1 if in place."""
         return np.where(self.near(ways), self._off(ways), self._looked_up(self._at(ways)))
 
     def near(self, ways: Floats) -> Bools:
-        """(...) whether nothing is left."""
+        """(...) whether tokens with these remaining ways (..., 3) are in place."""
         far, turn = np.hypot(ways[..., 0], ways[..., 1]), np.abs(self._wrapped(ways[..., 2]))
         return np.asarray((far <= self._scale[0]) & (turn <= self._scale[2]))
 
     def _off(self, ways: Floats) -> Floats:
-        """(...) cost of tokens in place that are not quite where they should be."""
+        """(...) cost of the remaining errors of tokens in place."""
         parts = ways[..., 0], ways[..., 1], self._wrapped(ways[..., 2])
         found: Floats = np.linalg.norm(np.stack(parts, axis=-1) / self._scale, axis=-1)
         return self._margin * found
@@ -102,7 +102,7 @@ class Left:
         return least
 
     def _at(self, ways: Floats) -> Floats:
-        """(3, ...) where they lie on the grid."""
+        """Coordinates (3, ...) of ways (..., 3) on the grid."""
         parts = ways[..., 0], ways[..., 1], self._wrapped(ways[..., 2])
         each = zip(parts, self._scale, self._most, GRID, strict=True)
         rows = [
@@ -111,7 +111,7 @@ class Left:
         return np.stack(rows)
 
     def _looked_up(self, at: Floats) -> Floats:
-        """(...) between the points of the grid; one push at least."""
+        """(...) numbers of pushes interpolated on the grid; at least 1."""
         found: Floats = map_coordinates(self._counts, at, order=1, mode="nearest")
         return np.maximum(found, 1.0)
 
@@ -120,14 +120,14 @@ class Left:
 def tried_alone(
     shape: Shape, known: tuple[float, float], finger: float, longest: float, *within: float
 ) -> tuple[Pushes, Left]:
-    """Random pushes of a shape, and how many it needs; some seconds when it is asked for first.
+    """Random pushes of a shape, and the number that it needs; the first call takes seconds.
 
     Args:
-        shape: of the token.
-        known: the finger's friction, and the squared lever of the table's.
-        finger: its radius.
-        longest: way of the longest push.
-        *within: tolerances of a token that is in place, of distance and turn, and the margin.
+        shape: shape of the token.
+        known: friction coefficient of the finger, and squared lever of the table's friction.
+        finger: radius of the finger.
+        longest: length of the longest push.
+        *within: tolerances of distance and turn, and the margin, as in `Left`.
     """
     layout, rng = Layout([shape]), np.random.default_rng(0)
     table, present = PushTable(layout, finger), np.ones(1, np.bool_)

@@ -1,4 +1,4 @@
-"""Tables on which a finger pushes tokens, several in step.
+"""Environments of task=push: several tables in one process.
 
 Legend: B environments, K tokens, V corners.
 """
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 
 
 class PushEnv(Env):
-    """B tables; see `Push`.
+    """B simulated tables; see `Push`.
 
     Attributes:
-        refused: (B,) why the last push moved nothing, empty where it could.
-        unknowns: (B,) what was drawn for the episode: for planners that are told.
-        corners, goals: (B, V, 2) of the tokens as they are, and of their places.
+        refused: (B,) why the last push moved nothing; empty if it was made.
+        unknowns: (B,) hidden parameters of the episode, for planners that may know them.
+        corners, goals: (B, V, 2) exact corners of the tokens and of their places.
     """
 
     def __init__(self, task: "Push", count: int, fewer: Sequence[float] = ()) -> None:
-        """Set up the tables; weights of 1, 2, ... tokens, none: as many as the task has."""
+        """Set up the tables; `fewer` has weights of 1, 2, ... tokens, empty: always task.count."""
         self.count, self._task = count, task
         some = np.array(fewer[: task.count])
         self._fewer = some / some.sum() if some.any() else some[:0]
@@ -41,11 +41,11 @@ class PushEnv(Env):
         self.corners: Floats = np.full(shape, AWAY)
         self.goals: Floats = np.full(shape, AWAY)
         self._cameras = []
-        if task.config.pixels:  # else not even imported: that takes time and memory
+        if task.config.pixels:  # imported only if needed: it takes time and memory
             from tangram_tasks.push.looking import Camera  # noqa: PLC0415
 
             self._cameras = [Camera(task.layout, task.config.pixels) for _ in range(count)]
-        # As they are seen: pushes go by that.
+        # Corners as the agent sees them; pushes refer to these.
         self._shown = self.corners.copy() if self._cameras else self.corners
         self._present: Bools = np.zeros((count, task.layout.tokens), np.bool_)
         self.refused, self._ended = [""] * count, np.zeros(count, np.bool_)
@@ -75,7 +75,7 @@ class PushEnv(Env):
         return self._seen()
 
     def step(self, actions: Singles) -> Step:
-        """Push once on every table on which not all is in place."""
+        """Push once on every table whose episode has not terminated."""
         layout, config = self._task.layout, self._task.config
         self.refused = [""] * self.count
         for b in np.flatnonzero(~self._ended).tolist():
@@ -87,7 +87,7 @@ class PushEnv(Env):
                 self.corners[b] = corners_of(layout, poses, there)
                 if self._cameras:
                     self._shown[b] = self._cameras[b].after(self.corners[b], push.token)
-        # As the master has them, which comes to the same reward.
+        # Rounded as on the master, so that it computes the same reward.
         corners, goals = self._shown.astype(np.float32), self.goals.astype(np.float32)
         placed = self._task.placed(corners, goals)
         rewards = self._task.paid(placed, self._present)
@@ -95,19 +95,19 @@ class PushEnv(Env):
         return Step(self._seen(), rewards, self._ended.copy())
 
     def _push(self, b: int, begin: Floats, way: Floats) -> str:
-        """Push on a table; why an arm could not."""
+        """Push on a table; returns why the arm cannot, empty if it can."""
         path = np.stack([begin, begin + way])
         if self.arms:
             motion = self.arms[b].push(begin * METRES, way * METRES)
             if motion is None:
-                return "the arm does not get there"
+                return "the arm cannot reach there"
             path = motion.pushed / METRES
         for _ in self.tables[b].follow(path):
             pass
         return ""
 
     def facts(self) -> Arrays:
-        """Exact corners and goals, whether the last push was refused, and what nobody is told."""
+        """Exact corners and goals, whether the last push was refused, and hidden parameters."""
         unknowns = [asdict(one) for one in self.unknowns]
         return {name: np.array([one[name] for one in unknowns]) for name in unknowns[0]} | {
             "corners": self.corners.copy(),
@@ -116,25 +116,25 @@ class PushEnv(Env):
         }
 
     def told(self) -> Json:
-        """Why the last push moved nothing, where it did not."""
+        """Why the last push of the first table moved nothing; empty if it was made."""
         return {"refused": self.refused[0]} if self.refused[0] else {}
 
     def picture(self, size: int) -> Pixels:
-        """The first table from above."""
+        """Draw the first table from above, (size, size, 3)."""
         from tangram_sim.drawing.scenes import draw_scene  # noqa: PLC0415
 
         scene = (self.corners[0], self.goals[0], size, None)
         return np.asarray(draw_scene(self._task.layout, ARENA, *scene), np.uint8)
 
     def close(self) -> None:
-        """End the engine's clients."""
+        """Close the engines of all tables and arms."""
         for table in self.tables:
             table.close()
         for arm in self.arms:
             arm.close()
 
     def _drawn(self, rng: np.random.Generator) -> Unknowns:
-        """Frictions and centres of mass of an episode."""
+        """Draw frictions and centres of mass for an episode."""
         layout, config = self._task.layout, self._task.config
         tokens, own = layout.tokens, config.table_friction
         spread, finger = config.spread, config.finger_friction

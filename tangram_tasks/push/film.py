@@ -1,6 +1,6 @@
 """Films of a finger that pushes: from above, or of the arm that holds it.
 
-What was between two pushes is recorded; what a push did on its way is simulated again.
+Poses between pushes are recorded; the motion during a push is simulated again.
 """
 
 from collections.abc import Iterator
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from tangram_tasks.push.task import Push as Task
 
 WIDTH, PARTS = 720, 6  # pixels; frames of a push from above
-FRAMES = 150  # of the film of an arm, for an episode
+FRAMES = 150  # for each episode, in the film of an arm
 
 
 class Replayed:
-    """One of the episodes that were played, push by push."""
+    """One played episode, push by push."""
 
     def __init__(self, task: "Task", played: Played, episode: int) -> None:
         facts = {name: one[episode] for name, one in played.facts.items()}
         self.task, self.corners, self.goals = task, facts["corners"], facts["goals"][0]
         self.present = on_table(self.goals, task.layout)
         self.actions = played.episodes.actions[episode]
-        self.shown = self.corners  # by which it was pushed
+        self.shown = self.corners  # corners that the agent saw
         if task.config.pixels:
             self.shown = played.episodes["corners"][episode].astype(np.float64)
         ended = played.episodes.terminated[episode].astype(bool)
@@ -45,14 +45,14 @@ class Replayed:
         self.unknowns = Unknowns(table, spread, float(finger), centres)
 
     def push(self, number: int) -> Push | None:
-        """Which push was tried; None: the finger could not come down."""
+        """The push with this number; None if the finger could not come down."""
         config = self.task.config
         given = self.shown[number], self.actions[number], config.finger, config.longest
         push = push_of(self.task.layout, *given)
         return None if push.refused else push
 
     def followed(self, table: PushTable, number: int, path: Floats) -> list[Floats]:
-        """Corners (V, 2) at each point of a finger's path, ending as they were recorded."""
+        """Corners (V, 2) at each point of a finger's path; the last ones are those recorded."""
         layout = self.task.layout
         table.place(layout.poses(self.corners[number]), self.present, self.unknowns)
         found = [self.corners[number] for _ in path]
@@ -64,7 +64,7 @@ class Replayed:
 
 
 def from_above(task: "Task", played: Played) -> Iterator[Image.Image]:
-    """All episodes beside each other, push after push."""
+    """Frames of all episodes side by side, push after push."""
     episodes = [Replayed(task, played, e) for e in range(len(played.episodes.actions))]
     columns, size = tiles(len(episodes), WIDTH)
     with closing(PushTable(task.layout, task.config.finger)) as table:
@@ -91,7 +91,7 @@ def _way(one: Replayed, table: PushTable, number: int, size: int) -> list[Image.
 
 
 def from_the_side(task: "Task", played: Played) -> Iterator[Image.Image]:
-    """The arm that pushes, one episode after the other."""
+    """Frames of the arm that pushes, one episode after the other."""
     for episode in range(len(played.episodes.actions)):
         one, arm = Replayed(task, played, episode), Panda()
         with closing(arm), closing(PushTable(task.layout, task.config.finger)) as table:

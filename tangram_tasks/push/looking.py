@@ -1,4 +1,4 @@
-"""What a camera above a table shows: where its tokens lie.
+"""Corners of tokens, found in the pictures of a camera above the table.
 
 Legend: K tokens, V corners.
 """
@@ -15,14 +15,14 @@ from tangram_vision.pictures.seeing import see
 
 
 class Camera:
-    """Finds the tokens of one table in pictures from above."""
+    """Finder of the tokens of one table in pictures from above."""
 
     def __init__(self, layout: Layout, pixels: int) -> None:
         self._layout = layout
         self._sim = SimConfig(arena=ARENA, pixels=pixels, observe="pictures")
 
     def begin(self, corners: Floats, present: Bools) -> Floats:
-        """(V, 2) corners as they are seen of tokens (K,) that are on the table."""
+        """Begin an episode; returns corners (V, 2) as seen. `present` (K,): tokens on the table."""
         self._tokens = np.flatnonzero(present)
         self._rows = present[self._layout.token_of_corner]
         self._part = own = part(self._layout, tuple(self._tokens.tolist()))
@@ -36,13 +36,13 @@ class Camera:
         return self._as_seen(corners)
 
     def after(self, corners: Floats, pushed: int) -> Floats:
-        """(V, 2) the same, after a token was pushed; equal ones keep their names."""
+        """Corners (V, 2) as seen after a token was pushed; equal tokens keep their numbers."""
         moved = np.flatnonzero(self._tokens == pushed)
         self._sight.follow(self._picture(corners), moved, np.zeros((1, 3)))
         return self._as_seen(corners)
 
     def _picture(self, corners: Floats) -> Pixels:
-        """(1, P, P)."""
+        """A picture (1, P, P) from above."""
         return photograph(corners[self._rows], self._part, self._sim)[None]
 
     def _as_seen(self, corners: Floats) -> Floats:

@@ -1,9 +1,9 @@
-"""Which tokens come next, so that no place is shut before its token is in it.
+"""Order of the tokens, so that no place is blocked before its token is in it.
 
-A place is the freer the more directions lead out of it past the tokens that lie already. Convex
-shapes can always be laid so that each slides in from one side. The best order leaves the least
-free place as free as can be; it is looked for among all of them. Once a place is shut it says
-nothing any more: all may come next that leave no other less free.
+A place is freer, the more directions lead out of it past the tokens that are in place. Convex
+shapes can always be laid so that each slides in from one side. The best order, searched among all,
+keeps the least free place as free as possible. Once a place is blocked, all orders are equally bad,
+and every remaining token may come next.
 
 Legend: K tokens, n of them on the table, V corners, D directions; a set of tokens is a number with
 a bit for each.
@@ -21,22 +21,23 @@ from tangram_tasks.push.places import on_table
 DIRECTIONS = 48
 MOVED = 0.05, 0.15  # how far a token of mean radius RADIUS is moved to see what is in its way
 RADIUS = 0.22278013147330306  # of the seven tans of tokens=tangram7
-ASIDE = 0.02  # share of a token that may come over another: it is pushed aside a little
-ROOMY = 20  # directions that are enough: 150 degrees
-MOST = 10  # tokens that are put in order
-COVERED = 0.1  # share of a token on another's place that must go first
+ASIDE = 0.02  # share of a token's area that may overlap another, which gives way a little
+ROOMY = 20  # free directions that are enough: 150 degrees
+MOST = 10  # tokens of which all orders are searched
+COVERED = 0.1  # share of a token's area on another's place that makes the token go first
 
 
 def come_next(layout: Layout, corners: AnyArray, goals: AnyArray, placed: Bools) -> Bools:
-    """(K,) which tokens may be pushed: the next of a best order, and those that lie where they go.
+    """(K,) which tokens may be pushed: the next ones of a best order, and tokens on their places.
 
-    Of more than MOST on the table any that is not in its place: there are too many orders.
+    With more than MOST tokens on the table, every token that is not in place may be pushed, because
+    there are too many orders.
 
     Args:
         layout: the tokens.
-        corners: (V, 2) of the tokens.
-        goals: (V, 2) of their places.
-        placed: (K,) which are in them.
+        corners: (V, 2) corners of the tokens.
+        goals: (V, 2) corners of their places.
+        placed: (K,) tokens that are in place.
     """
     there = on_table(goals, layout)
     found, tokens = there & ~placed, np.flatnonzero(there)
@@ -54,9 +55,9 @@ def come_next(layout: Layout, corners: AnyArray, goals: AnyArray, placed: Bools)
 
 @lru_cache(maxsize=128)
 def _orders(layout: Layout, goals: bytes) -> tuple[Ints, Ints]:
-    """Of each set that lies, how free the least free place will be: (2**n,), by token (2**n, n).
+    """For each set of tokens in place, directions that the least free place will keep at best.
 
-    Of the n tokens on the table; -1 for one that lies.
+    By the best order (2**n,), and with each token next (2**n, n), -1 for one that is in place.
     """
     corners = np.frombuffer(goals).reshape(-1, 2)
     tokens = np.flatnonzero(on_table(corners, layout))
@@ -72,7 +73,7 @@ def _orders(layout: Layout, goals: bytes) -> tuple[Ints, Ints]:
 
 
 def _free(layout: Layout, corners: Floats, tokens: Ints) -> Bools:
-    """(n, n, D) in which directions one of tokens (n,) gets out of its place past another."""
+    """(n, n, D) directions in which one of tokens (n,) can leave its place past another."""
     outlines = corners[layout.padded_corners[tokens]]
     far = np.array(MOVED) * (layout.radii.mean() / RADIUS)
     ways = np.exp(2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)[:, None] * far

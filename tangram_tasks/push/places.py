@@ -1,4 +1,4 @@
-"""Which tokens are in their places, what a push is, and where an episode begins and ends.
+"""Geometry of task=push: errors of tokens, pushes of actions, starts and goals of episodes.
 
 Legend: n rows, K tokens, V corners.
 """
@@ -21,7 +21,7 @@ ARENA = 2.0  # width of the table
 AWAY = 3.0  # x and y of all corners of a token that is not on the table
 GAP = 0.005  # between finger and token where the finger comes down
 STEEPEST = np.pi / 3.0  # largest angle between a push and the inward normal of the edge
-LEAST = 0.02  # way of the shortest push, after the finger has met the token
+LEAST = 0.02  # length of the shortest push, after the finger has met the token
 
 
 def on_table(corners: AnyArray, layout: Layout) -> Bools:
@@ -31,7 +31,7 @@ def on_table(corners: AnyArray, layout: Layout) -> Bools:
 
 
 def corners_of(layout: Layout, poses: Floats, present: Bools) -> Floats:
-    """(V, 2) of poses (K, 3); AWAY those that are not on the table."""
+    """Corners (V, 2) of poses (K, 3); AWAY for tokens that are not on the table."""
     corners = layout.corners(poses)
     corners[~present[layout.token_of_corner]] = AWAY
     return corners
@@ -47,13 +47,13 @@ def errors(layout: Layout, achieved: Floats, desired: Floats) -> tuple[Floats, F
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """Where the finger comes down, and its way.
+    """Straight way of the finger beside a token.
 
     Attributes:
-        token: that is pushed.
-        begin: (2,) of its centre.
-        way: (2,) that it goes; it stays on the table.
-        refused: why it cannot come down; nothing moves then. Empty: it can.
+        token: number of the token to push.
+        begin: (2,) point at which the centre of the finger comes down.
+        way: (2,) from there to its last point, which is on the table.
+        refused: why the finger cannot come down, so that nothing moves; empty if it can.
     """
 
     token: int
@@ -65,7 +65,7 @@ class Push:
 def push_of(
     layout: Layout, corners: Floats, action: AnyArray, finger: float, longest: float
 ) -> Push:
-    """What an action (4,) means where tokens have corners (V, 2); see `ways_of`."""
+    """The push of an action (4,) among tokens with corners (V, 2); see `ways_of`."""
     tokens, begins, ways = ways_of(layout, corners[None], np.asarray(action)[None], finger, longest)
     token, begin, way = int(tokens[0]), begins[0], ways[0]
     if not on_table(corners, layout)[token]:
@@ -82,18 +82,18 @@ def push_of(
 def ways_of(
     layout: Layout, corners: Floats, actions: AnyArray, finger: float, longest: float
 ) -> tuple[Ints, Floats, Floats]:
-    """Which tokens (n,), where the finger comes down beside them (n, 2), and its way (n, 2).
+    """Tokens (n,), points (n, 2) where the finger comes down beside them, and its ways (n, 2).
 
-    No way where it would come down, or go, beyond the table; whether others are in the way is not
-    looked at.
+    A way ends at the edge of the table. It is 0 if the finger would come down beyond the edge, or
+    too near to it for a push. Other tokens in the way are not checked.
 
     Args:
         layout: the tokens.
-        corners: (n, V, 2) of the tokens.
-        actions: (n, 4) in [-1, 1]: which token, where on its edge (a share of its perimeter from
-            its first corner on), the direction against the inward normal, how far.
-        finger: its radius.
-        longest: way of the longest push, after the finger has met the token.
+        corners: (n, V, 2) corners of the tokens.
+        actions: (n, 4) in [-1, 1]: token, place on its edge (a share of its perimeter from its
+            first corner on), direction relative to the inward normal, and length.
+        finger: radius of the finger.
+        longest: length of the longest push, after the finger has met the token.
     """
     which, where, turn, far = np.asarray(actions, np.float64).T
     tokens = np.minimum(((which + 1.0) / 2.0 * layout.tokens).astype(np.int64), layout.tokens - 1)
@@ -119,13 +119,14 @@ def _on_edge(corners: AnyArray, shares: Floats) -> tuple[AnyArray, AnyArray]:
     # The last edge with a length: corners of small polygons repeat their last one.
     edge = np.minimum((ends <= far[:, None]).sum(axis=1), (ends < ends[:, -1:]).sum(axis=1))
     rows = np.arange(len(edge))
-    along = edges[rows, edge] / np.maximum(lengths[rows, edge], 1e-12)  # away it has no size
+    # The lower bound is for tokens that are AWAY: their edges have no length.
+    along = edges[rows, edge] / np.maximum(lengths[rows, edge], 1e-12)
     points = corners[rows, edge] + along * (far - ends[rows, edge] + lengths[rows, edge])
     return points, along * 1j
 
 
 def apart(outlines: AnyArray, points: AnyArray) -> Floats:
-    """(...) from points (...) to convex polygons (..., C), 0 inside; all complex numbers."""
+    """Distances (...) of complex points (...) to convex polygons (..., C) of such; 0 inside."""
     edges, to = np.roll(outlines, -1, axis=-1) - outlines, points[..., None] - outlines
     squares = np.abs(edges) ** 2
     share = np.clip((edges.conj() * to).real / np.where(squares > 0.0, squares, 1.0), 0.0, 1.0)
@@ -137,13 +138,14 @@ def apart(outlines: AnyArray, points: AnyArray) -> Floats:
 def begin(
     layout: Layout, count: int, rng: np.random.Generator, figures: Sequence[Floats] = ()
 ) -> tuple[Ints, Floats, Floats]:
-    """Which tokens an episode has, (count,), and poses (count, 3) of their start and their goal.
+    """Draw the tokens of an episode (count,), and their start and goal poses (count, 3).
 
-    One goes anywhere; several go where they touch edge to edge, all seven tans also into figures
-    that people know, or all of them into one of the figures (K, 3). They start apart.
+    With `figures`, poses (K, 3) of all tokens, the goal is one of these at a random angle. Else one
+    token has a random goal, and several touch edge to edge; all seven tans may also make a figure
+    of the library. The tokens start apart.
 
     Raises:
-        SamplingError: no room.
+        SamplingError: the tokens find no room on the table.
     """
     tokens = np.sort(rng.permutation(layout.tokens)[:count])
     own = part(layout, tuple(tokens.tolist()))
@@ -167,10 +169,10 @@ def begin(
 
 
 def figures_of(layout: Layout, scale: float, named: Sequence[str]) -> Iterator[Floats]:
-    """Poses (K, 3) of the tokens in figures of the library, mirrored where one would lie flipped.
+    """Poses (K, 3) of the tokens in figures of the library, mirrored if a token would be flipped.
 
     Raises:
-        ConfigError: there is no such figure, it has other pieces, or the table is too small.
+        ConfigError: a figure is unknown or has other pieces, or the table is too small.
     """
     known = {split: library(split, scale) for split in ("train", "test") if named}
     known |= {one.name: (one,) for of_split in [*known.values()] for one in of_split}
@@ -183,13 +185,13 @@ def figures_of(layout: Layout, scale: float, named: Sequence[str]) -> Iterator[F
             reach = float(np.linalg.norm(layout.corners(poses), axis=1).max())
             if reach > ARENA / 2.0:
                 raise ConfigError(
-                    f"puzzle '{one.name}' reaches {reach:.2f} from its middle and the table "
-                    f"{ARENA / 2.0:g}: lower tokens.scale"
+                    f"puzzle '{one.name}' reaches {reach:.2f} from its middle, and the table "
+                    f"only {ARENA / 2.0:g}: lower tokens.scale"
                 )
             yield poses
 
 
 @lru_cache(maxsize=256)
 def part(layout: Layout, tokens: tuple[int, ...]) -> Layout:
-    """Some tokens of a set."""
+    """The layout of some tokens of a set."""
     return Layout([layout.shapes[token] for token in tokens])

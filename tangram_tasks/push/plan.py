@@ -15,11 +15,11 @@ from tangram_tasks.push.places import ARENA
 if TYPE_CHECKING:
     from tangram_tasks.push.task import Push
 
-FRAME = "the origin is the middle of the table's top, x goes right, y away, z up; the arm is left"
+FRAME = "origin: middle of the table top; x points right, y away, z up; the arm stands on the left"
 
 
 def plan_of(task: "Push", played: Played) -> Json:
-    """The first episode's pushes; where an arm held the finger, with the joints' angles."""
+    """Pushes of the first episode as JSON; with an arm also the angles of its joints."""
     one, layout = Replayed(task, played, 0), task.layout
     tokens = [
         {"shape": layout.shapes[token].name}

@@ -1,8 +1,8 @@
-"""Who plays without learning: by pushes of each shape tried alone, and by trials in an engine.
+"""Baselines that learned nothing: a table of pushes of single tokens, and planners that simulate.
 
-A push is worth what it leaves: the pushes that each token then needs if it lies alone, and more
-where finger and token would meet others on their way. The table looks for the best push in thought;
-a planner tries the best of them in an engine of its own.
+The cost of a push is the number of pushes that the tokens need afterwards, each as if alone.
+Collisions of finger and token with others on the way add to it. The table takes the push of least
+estimated cost. A planner also simulates the best of them, in an engine of its own.
 
 Legend: N pushes of a shape, n rows, K tokens, V corners, C corners of a token, m pushes.
 """
@@ -26,30 +26,30 @@ if TYPE_CHECKING:
     from tangram_tasks.push.env import PushEnv
     from tangram_tasks.push.task import Push
 
-TRIED = 24  # pushes in an engine
-LOOKED_AT, LENGTH = 48, 6  # pushes in thought, half the best, half any; and one after another
-PAIR = 2  # tokens of which each may come first
-SHARES = 1.0 / 3.0, 2.0 / 3.0, 1.0  # of a token's way that are looked at
-SLACK, SLOPE, HARDEST = 0.004, 40.0, 1.5  # depth that costs nothing, cost of more, and its most
-NEVER, MOST = 100.0, 3.0  # cost of what cannot be done; as much as one push in thought may cost
-MARGIN = 0.5  # cost to the table of a token that is as far away as it may be in place
-AGAIN, REACH = 0.5, 0.1  # cost of what leads to what has been before, and how near that is
-STILL = 1e-4  # corners that are all nearer than this have not moved
-WRONG = 2.0  # by which a planner is wrong about friction
+TRIED = 24  # pushes that are simulated for an action
+LOOKED_AT, LENGTH = 48, 6  # pushes to estimate, half the best, half any; pushes in a row
+PAIR = 2  # up to so many tokens, each may come first
+SHARES = 1.0 / 3.0, 2.0 / 3.0, 1.0  # of a token's way, where collisions are checked
+SLACK, SLOPE, HARDEST = 0.004, 40.0, 1.5  # depth without cost, cost of more depth, largest cost
+NEVER, MOST = 100.0, 3.0  # cost of an impossible push; largest cost of an estimated collision
+MARGIN = 0.5  # for `table`: cost of a token just within tolerance
+AGAIN, REACH = 0.5, 0.1  # cost of a return to an earlier state; distance that counts as one
+STILL = 1e-4  # corners that moved by less did not move
+WRONG = 2.0  # factor by which planner_wrong errs about friction
 
 
 class Planner:
-    """Chooses by what was tried of each shape alone, and by trials in an engine where there are."""
+    """A policy that estimates pushes from those of single tokens, and may simulate the best."""
 
     def __init__(self, task: "Push", env: "PushEnv", tried: int = 0, knows: str = "middle") -> None:
-        """Try pushes of each shape.
+        """Simulate random pushes of each shape.
 
         Args:
-            task: what is played.
-            env: where.
-            tried: pushes that are tried in an engine before one is played; 0: none.
-            knows: of friction and centres of mass: middle, of what they are drawn from; all; wrong,
-                the finger's friction and the lever of the table's twice the middle.
+            task: the task to play.
+            env: its environments, which `knows="all"` asks for the hidden parameters.
+            tried: pushes that are simulated for each action; 0: none.
+            knows: assumed friction and centres of mass: middle (of their ranges), all (the true
+                ones) or wrong (finger's friction and lever of the table's twice the middle).
         """
         self._middle, config, layout = middle(task), task.config, task.layout
         self._env, self._count, self._knows = env, tried, knows
@@ -62,7 +62,7 @@ class Planner:
         self._bodies = layout.body[layout.padded_corners] @ (1.0, 1j)
 
     def __call__(self, seen: Arrays, past: History, generators: Generators) -> Singles:
-        """(B, 4) the push after which least is left to go."""
+        """Actions (B, 4): for each table the push of least cost."""
         tables = range(len(generators))
         return np.stack([self._best(seen, past, table) for table in tables]).astype(np.float32)
 
@@ -95,11 +95,11 @@ class Planner:
         return np.asarray(played[int(left.argmin())][0])
 
     def _proposed(self, corners: Floats, goals: Floats, made: AnyArray) -> tuple[Floats, Ints]:
-        """(m, 4) the best pushes first, but those that did nothing here, and of which tokens."""
+        """Pushes (m, 4) by cost, without those that moved nothing here, and the tokens tried."""
         placed = self._task.placed(corners[None], goals[None])[0]
         left = on_table(goals, self._layout) & ~placed
         following = come_next(self._layout, corners, goals, placed)
-        for tokens in (following, left):  # where none can be pushed that comes next, any
+        for tokens in (following, left):  # any token, if no next one can be pushed
             costs, pushes = self._ranked(tokens, corners, goals)
             here = np.abs(pushes[:, None] - made).max(axis=2, initial=0.0) < STILL
             possible = (costs < NEVER / 2.0) & ~here.any(axis=1)
@@ -109,7 +109,7 @@ class Planner:
         return pushes[possible][order], np.flatnonzero(tokens)
 
     def _ranked(self, those: Bools, corners: Floats, goals: Floats) -> tuple[Floats, Floats]:
-        """What all pushes of some tokens (K,) cost more than the best of the same one, and them."""
+        """All pushes of some tokens (K,), with their cost above the same token's best push."""
         layout, costs, pushes = self._layout, [np.zeros(0)], [np.zeros((0, 4))]
         poses, desired = layout.poses(corners), layout.poses(goals)
         for token in np.flatnonzero(those).tolist():
@@ -125,10 +125,10 @@ class Planner:
         return np.concatenate(costs), np.concatenate(pushes)
 
     def _worth(self, corners: Floats, goals: Floats, following: Ints) -> Floats:
-        """(n,) pushes that are left where tokens have corners (n, V, 2), in the better order.
+        """(n,) pushes that tokens at corners (n, V, 2) still need, with the best first token.
 
-        One of those that come next goes first, beside the others; with two the other goes then,
-        beside the first in its place; more are taken to lie alone.
+        The first token moves beside all others. Of two tokens, the second then moves beside the
+        first in its place. Of more, each of the others counts as if it lay alone.
         """
         poses, desired = self._layout.poses(corners), self._layout.poses(goals)
         there = np.flatnonzero(on_table(goals, self._layout)).tolist()
@@ -149,9 +149,9 @@ class Planner:
     def _followed(
         self, token: int, poses: Floats, desired: Floats, others: Sequence[Complex]
     ) -> Floats:
-        """(n,) pushes that bring a token from poses (n, 3) home in thought, beside outlines (n, C).
+        """(n,) estimated pushes to bring a token from poses (n, 3) home, beside outlines (n, C).
 
-        The best each time; after LENGTH of them as many as it needs alone.
+        Takes the best push LENGTH times; the rest counts as if the token lay alone.
         """
         left, own, poses = self._left[token], self._tried[token].moved, poses.copy()
         alone, whole, half = left(way_left(poses, desired)), np.zeros(len(poses)), LOOKED_AT // 2
@@ -183,7 +183,7 @@ class Planner:
         return _places(poses)[:, None] + turned
 
     def _met(self, token: int, poses: Floats, pushes: Ints, others: Sequence[Complex]) -> Floats:
-        """(n,) cost of what finger and token meet by pushes (n,) of a token at poses (n, 3)."""
+        """(n,) cost of collisions in pushes (n,) of a token at poses (n, 3)."""
         own, radius = self._tried[token], self._task.config.finger
         turn, place, moved = np.exp(1j * poses[:, 2]), _places(poses), own.moved[pushes]
         begin, end = (place + turn * _places(at[pushes]) for at in (own.begins, own.ends))
@@ -207,7 +207,7 @@ def _places(poses: Floats) -> Complex:
 
 
 def _gaps(some: Complex, others: Complex) -> Floats:
-    """(n,) between convex polygons (n, C), by the separating axis theorem; minus the depth."""
+    """(n,) gaps of convex polygons (n, C), by the separating axis theorem; below 0: overlap."""
     found = list[Floats]()
     for one, other in ((some, others), (others, some)):
         edges = np.roll(one, -1, axis=1) - one

@@ -1,4 +1,4 @@
-"""A finger pushes tokens into place; friction is drawn for each episode, and nobody is told.
+"""Task `push`: a finger pushes tokens into place, with hidden friction in each episode.
 
 Legend: E episodes, T pushes of an episode, K tokens, V corners, n rows.
 """
@@ -24,67 +24,73 @@ from tangram_tasks.push.places import ARENA, begin, errors, figures_of, on_table
 if TYPE_CHECKING:
     from tangram_tasks.push.env import PushEnv
 
-PER_TOKEN = 8  # pushes that an episode has for each token
-FURTHEST = 8.0  # of a corner: only what is wrong lies beyond
+PER_TOKEN = 8  # pushes of an episode for each token
+FURTHEST = 8.0  # largest coordinate of a corner; only errors lie beyond
 PICTURES, PIXELS = 12, 216
 DRAWS = 8  # layouts that must find room before a run begins
 
 
 @dataclass(frozen=True)
 class PushConfig(Settings, section="task"):
-    """What lies on the table, what pushes it, and when it is in place."""
+    """Tokens and finger, their hidden friction, and the tolerances of a place."""
 
     count: int = setting(
         0,
-        "tokens on the table, drawn from the set for each episode; 0: all of it",
+        "tokens on the table, drawn from the set for each episode; 0: all tokens",
         low=0,
         high=16,
     )
     fewer: tuple[float, ...] = setting(
         (),
-        "weights of episodes with 1, 2, 3, ... tokens while it learns; none: always task.count",
+        "in training, weights of episodes with 1, 2, 3, ... tokens; []: always task.count",
         low=0,
         part=LEARNING,
     )
     puzzle: tuple[str, ...] = setting(
         (),
-        "figures that the seven tans are to make, one for each episode, at any angle: names of the "
-        "library, or train or test for all of these; none: tokens touch as chance has it, or as "
-        "figures of train do",
+        "figures of the library that the seven tans must make, one in each episode, at a random "
+        "angle: names, or train or test for a whole split; []: random layouts of touching tokens, "
+        "or figures of train",
     )
-    within: float = setting(0.03, "distance at which a token is in its place", low=1e-4, high=1)
-    turned: float = setting(0.1, "turn within which it is", low=1e-4, high=4, unit="rad")
-    finger: float = setting(0.04, "the finger's radius", low=0.005, high=0.2)
+    within: float = setting(0.03, "distance within which a token is in place", low=1e-4, high=1)
+    turned: float = setting(
+        0.1, "turn within which a token is in place", low=1e-4, high=4, unit="rad"
+    )
+    finger: float = setting(0.04, "radius of the finger", low=0.005, high=0.2)
     hand: str = setting(
         "finger",
-        "finger: it goes wherever it should; panda: a robot's arm holds it, as joints allow",
+        "what pushes: finger, a finger that reaches every place; panda, a finger on a robot's arm, "
+        "as far as its joints allow",
         choices=("finger", "panda"),
     )
-    longest: float = setting(0.5, "way of the longest push", low=0.05, high=2)
+    longest: float = setting(0.5, "length of the longest push", low=0.05, high=2)
     pixels: int = setting(
         0,
-        "side of a picture in which tokens are found, from 16; 0: their corners are known",
+        "side of the pictures in which tokens are found, from 16; 0: agents see exact corners",
         low=0,
         high=1024,
     )
     table_friction: tuple[float, ...] = setting(
         (0.5, 1.5),
-        "range of each token's friction on the table; only ratios count",
+        "range of the friction coefficient of each token on the table; only ratios count",
         low=0.01,
         high=100,
     )
     spread: tuple[float, ...] = setting(
         (0.9, 2.0),
-        "range of the squared lever of that friction, in squared radii of gyration: 0.9 where a "
-        "token is pressed alike everywhere, 2 and more where its corners carry it",
+        "range of the squared lever of the table's friction, in squared radii of gyration of the "
+        "token: 0.9 for even pressure, 2 and more if the corners carry the token",
         low=0.1,
         high=5,
     )
     finger_friction: tuple[float, ...] = setting(
-        (0.1, 0.6), "range of the coefficient of finger and token", low=0, high=2
+        (0.1, 0.6), "range of the friction coefficient of finger and token", low=0, high=2
     )
     centre: float = setting(
-        0.15, "largest distance of a centre of mass from the middle, in radii", low=0, high=0.5
+        0.15,
+        "largest distance from centre of area to centre of mass, in radii of the token",
+        low=0,
+        high=0.5,
     )
 
     def __post_init__(self) -> None:
@@ -107,9 +113,9 @@ class PushConfig(Settings, section="task"):
 class Push(Task):
     """Tokens on a table, and a finger that comes down, pushes along a straight line, and lifts.
 
-    An action is a push: which token, where on its edge, in which direction, how far. Where the
-    finger cannot come down nothing moves, and the push is spent. A push pays -1, and the share of
-    tokens that then are in place; an episode terminates when all are, and nothing moves any more.
+    An action is a push: which token, where on its edge, in which direction, how far. If the finger
+    cannot come down, nothing moves, and the push counts. The reward is the share of tokens that
+    are in place, minus 1. The episode terminates when all are in place; nothing moves any more.
     """
 
     agent: ClassVar[str] = "push"
@@ -125,29 +131,29 @@ class Push(Task):
     config: PushConfig = PushConfig()
 
     def __post_init__(self) -> None:
-        """Refuse more tokens than there are."""
+        """Raise ConfigError if task.count is more than the tokens of the set."""
         if self.config.count > self.layout.tokens:
             raise ConfigError(
-                f"task.count={self.config.count}, and there are {self.layout.tokens} tokens: set "
+                f"task.count={self.config.count}, and the set has {self.layout.tokens} tokens: set "
                 f"it to at most {self.layout.tokens}, or choose more tokens"
             )
 
     @cached_property
     def layout(self) -> Layout:
-        """The token set's fixed structure."""
+        """The fixed geometry of the token set."""
         return make_layout(self.tokens)
 
     @property
     def count(self) -> int:
-        """Tokens of an episode."""
+        """Number of tokens in an episode, unless `fewer` draws fewer."""
         return self.config.count or self.layout.tokens
 
     @cached_property
     def figures(self) -> tuple[Floats, ...]:
-        """Poses (K, 3) of the tokens in each figure that they are to make.
+        """Poses (K, 3) of the tokens in each figure of task.puzzle.
 
         Raises:
-            ConfigError: there is no such figure, or it has other pieces.
+            ConfigError: a figure is unknown or has other pieces, or the table is too small.
         """
         named = self.config.puzzle
         if named and self.count < self.layout.tokens:
@@ -159,7 +165,7 @@ class Push(Task):
 
     @cached_property
     def spec(self) -> EpisodeSpec:
-        """Corners of all tokens, and where they should come; AWAY where one is not there."""
+        """Corners and goals of all tokens; AWAY for a token that is not on the table."""
         shape = (self.layout.corner_count, 2)
         fields = (
             Field("corners", shape, -FURTHEST, FURTHEST),
@@ -176,33 +182,38 @@ class Push(Task):
         return near | ~on_table(goals, self.layout)
 
     def paid(self, placed: Bools, present: Bools) -> Floats:
-        """(n,) -1 and the share of tokens in place."""
+        """Rewards (n,): the share of tokens in place, minus 1."""
         counts = present.sum(axis=1)
         share: Floats = (placed & present).sum(axis=1) / np.maximum(counts, 1)
         return share - 1.0
 
     def rewards(self, achieved: Array, desired: Array) -> Floats:
-        """(n,) of corners (n, V, 2)."""
+        """Rewards (n,) of achieved and desired corners (n, V, 2)."""
         return self.paid(self.placed(achieved, desired), on_table(desired, self.layout))
 
     def ended(self, achieved: Array, desired: Array, recorded: Bools) -> Bools:  # noqa: ARG002
-        """(n,) whether all are in place."""
+        """(n,) whether all tokens are in place."""
         return np.asarray(self.placed(achieved, desired).all(axis=1))
 
     def check(self, *, plays: bool) -> None:
-        """Refuse tokens without room, weights of none, and to play where there is no engine."""
+        """Refuse wrong weights, tokens without room, and play without PyBullet or OpenCV.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+            SamplingError: the tokens find no room on the table.
+        """
         fewer = self.config.fewer
         if not plays and fewer and (len(fewer) > self.count or not sum(fewer)):
             raise ConfigError(
-                f"task.fewer={told(fewer)} must have at most {self.count} weights, of 1, 2, ... "
-                f"tokens, and one above 0: write it as {told((1,) * self.count)}"
+                f"task.fewer={told(fewer)} must have at most {self.count} weights, for 1, 2, ... "
+                f"tokens, with one above 0: write it as {told((1,) * self.count)}"
             )
         for seed in range(DRAWS):
             begin(self.layout, self.count, np.random.default_rng(seed), self.figures)
         if plays and find_spec("pybullet") is None:
             raise ConfigError(
-                "task=push needs PyBullet, which is missing: pip install pybullet, from Python "
-                "3.12 on pybullet-arm64"
+                "task=push needs PyBullet, which is missing: pip install pybullet, or from Python "
+                "3.12 on pip install pybullet-arm64"
             )
         if plays and self.config.pixels and find_spec("cv2") is None:
             raise ConfigError(
@@ -211,13 +222,13 @@ class Push(Task):
             )
 
     def make(self, count: int, purpose: Purpose = "play") -> Env:
-        """So many tables in this process."""
+        """Make `count` tables in this process."""
         from tangram_tasks.push.env import PushEnv  # noqa: PLC0415
 
         return PushEnv(self, count, self.config.fewer if purpose == "play" else ())
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """Chance, what was tried of each shape alone, and planners with an engine of their own."""
+        """Random pushes, a table of pushes of single tokens, and planners that simulate."""
         from tangram_tasks.push.rivals import TRIED, Planner  # noqa: PLC0415
 
         def planner(env: Env, knows: str) -> Chooser:
@@ -232,7 +243,7 @@ class Push(Task):
         }
 
     def score(self, played: Played) -> dict[str, float]:
-        """Of the moment at which all were in place first, or of the end."""
+        """Compute the scores at the first moment with all tokens in place, else at the end."""
         solved, last, ends = _ends(played)
         goals = played.facts["goals"][:, 0]
         present = on_table(goals, self.layout)
@@ -247,7 +258,7 @@ class Push(Task):
         }
 
     def draw(self, played: Played) -> Pixels:
-        """How the first episodes end."""
+        """Draw how the first episodes ended."""
         from tangram_sim.drawing.scenes import episode_sheet  # noqa: PLC0415
 
         starts, goals = (played.facts[name][:PICTURES, 0] for name in ("corners", "goals"))
@@ -257,14 +268,14 @@ class Push(Task):
         return np.asarray(sheet.convert("RGB"))
 
     def film(self, played: Played) -> Iterator[Pixels]:
-        """The finger from above, or the arm that holds it."""
+        """Frames of the finger from above, or of the arm that holds it."""
         from tangram_tasks.push.film import from_above, from_the_side  # noqa: PLC0415
 
         shown = from_the_side if self.config.hand == "panda" else from_above
         return (np.asarray(one) for one in shown(self, played))
 
     def plan(self, played: Played) -> Json:
-        """Way points of the finger."""
+        """Way points of the finger in the first episode; see `plan_of`."""
         from tangram_tasks.push.plan import plan_of  # noqa: PLC0415
 
         return plan_of(self, played)
@@ -278,11 +289,11 @@ class Push(Task):
         return shares
 
     def identity(self) -> Json:
-        """Tokens by what makes them."""
+        """Settings and token geometry, which must be equal on master and workers."""
         return super().identity() | {"tokens": {"layout": self.layout.fingerprint()}}
 
     def facts(self) -> Json:
-        """How many tokens there are."""
+        """The number of tokens, for result.json."""
         return {"task": f"push of {self.count}"}
 
 

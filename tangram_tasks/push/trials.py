@@ -1,4 +1,4 @@
-"""Pushes that are tried in an engine of one's own before one is played.
+"""Simulation of pushes, in a separate engine, before one is played.
 
 Legend: K tokens, V corners.
 """
@@ -16,27 +16,27 @@ if TYPE_CHECKING:
 
 
 def middle(task: "Push") -> Unknowns:
-    """The middle of what an episode draws."""
+    """The hidden parameters at the middle of the ranges from which episodes draw."""
     config, alike = task.config, np.ones(task.layout.tokens)
     spread, finger = float(np.mean(config.spread)), float(np.mean(config.finger_friction))
     return Unknowns(alike, spread * alike, finger, np.zeros((len(alike), 2)))
 
 
 class Trials:
-    """One table after the other."""
+    """A simulated table on which a planner tries pushes, for one table after the other."""
 
     def __init__(self, task: "Push") -> None:
         self._task, self._table = task, PushTable(task.layout, task.config.finger)
 
     def begin(self, corners: AnyArray, goals: AnyArray, unknowns: Unknowns) -> None:
-        """Lay tokens as they are seen, with corners and goals (V, 2)."""
+        """Lay tokens at observed corners (V, 2); `goals` (V, 2) tell which are on the table."""
         layout = self._task.layout
         self._corners = np.asarray(corners, np.float64)
         self._poses, self._there = layout.poses(self._corners), on_table(goals, layout)
         self._table.place(self._poses, self._there, unknowns)
 
     def after(self, action: AnyArray) -> Floats | None:
-        """Corners (V, 2) after a push (4,) of what was laid; None where it is refused."""
+        """Corners (V, 2) after an action (4,) on the tokens as laid; None if it is refused."""
         layout, config = self._task.layout, self._task.config
         push = push_of(layout, self._corners, action, config.finger, config.longest)
         if push.refused:

@@ -1,4 +1,4 @@
-"""What plays tokens and learned nothing: formulas and rules, to compare with.
+"""Baselines for tasks of tokens: formulas and rules that learned nothing.
 
-Start with `baselines.py`. May import tangram_core, tangram_sim and what scores are made of.
+Start with `baselines.py`. May import tangram_core, tangram_sim, `pairing.py` and `played.py`.
 """

@@ -1,4 +1,4 @@
-"""Three policies to compare with: chance, the position-only oracle and the exact oracle.
+"""Three baselines: random actions, the position-only oracle and the exact oracle.
 
 Legend: B environments, K tokens, V corners, A entries of an action.
 """
@@ -17,10 +17,10 @@ from tangram_tasks.played import as_seen
 
 
 def random_policy(layout: Layout, sim: SimConfig) -> Chooser:
-    """Chance: of one token every entry uniform in [-1, 1].
+    """Random actions: with one token, every entry is uniform in [-1, 1].
 
-    Of several, any that is left goes to any pose with its centre in the arena: uniform entries
-    would mostly name a placed token, or throw it out of the arena.
+    With several, a random token that is left goes to a random pose with its centre in the arena.
+    Uniform entries would mostly choose a placed token, or throw it out of the arena.
     """
     size = action_size(layout.tokens, sim)
 
@@ -39,9 +39,9 @@ def random_policy(layout: Layout, sim: SimConfig) -> Chooser:
 
 
 def position_policy(layout: Layout, sim: SimConfig) -> Chooser:
-    """Token after token exactly onto the centre of its own target, and never turned.
+    """Move each token exactly onto the centre of its own target, without a turn.
 
-    A square moved so overlaps by 0.8825 on average: that is the plateau of the paper's Table II.
+    A square moved in this way overlaps by 0.8825 on average, the plateau of the paper's Table II.
     """
 
     def choose(seen: Arrays, _past: History, _generators: Generators) -> Singles:
@@ -55,11 +55,11 @@ def position_policy(layout: Layout, sim: SimConfig) -> Chooser:
 
 
 def exact_policy(layout: Layout, sim: SimConfig) -> Chooser:
-    """Each token exactly onto a piece of its shape as it is seen, by the smallest turn that fits.
+    """Move each token exactly onto an observed piece of its shape, by the smallest turn.
 
-    Equal tokens share the pieces by the least way in all. Next is the one whose place is covered
-    least by others. What remains to a perfect score is the world's: places that cover each other in
-    a circle, float32 actions, and the engine's arithmetic.
+    Equal tokens share the pieces so that the sum of ways is least. The next token is the one whose
+    place others cover least. The score is not perfect for three reasons: tokens may lie on each
+    other's places in a circle, actions are float32, and the engine rounds.
     """
 
     def choose(seen: Arrays, _past: History, _generators: Generators) -> Singles:
@@ -74,13 +74,13 @@ def exact_policy(layout: Layout, sim: SimConfig) -> Chooser:
 
 
 def _any_left(placed: Bools, generator: np.random.Generator) -> int:
-    """One of the tokens that are not placed (K,), or any if all are."""
+    """A random token that is not placed (K,), or any if all are."""
     left = np.flatnonzero(~np.asarray(placed, dtype=np.bool_))
     return int(generator.choice(left if len(left) else len(placed)))
 
 
 def freest(layout: Layout, corners: Floats, placed: Bools, goals: Floats, pairing: Pairing) -> Ints:
-    """(B,) the token left whose place the others cover least; the first of several."""
+    """(B,) the remaining token whose place others cover least; the first in a tie."""
     rows, every = np.arange(len(corners))[:, None], np.arange(layout.tokens)
     places = outlines(goals, layout)[rows, pairing.target]
     shared = shared_areas(places, outlines(corners, layout))

@@ -1,4 +1,4 @@
-"""Which rivals play a task of tokens."""
+"""The rivals of a task of tokens."""
 
 from collections.abc import Callable, Mapping
 
@@ -9,10 +9,10 @@ from tangram_tasks.rivals.baselines import exact_policy, position_policy, random
 
 
 def rivals_of(layout: Layout, sim: SimConfig) -> Mapping[str, Callable[[Env], Chooser]]:
-    """Those that a world has, the strongest first.
+    """The baselines of a world by name, the strongest first.
 
-    `exact` moves every token exactly onto its target, `position only` one token onto its centre and
-    never turns it, `random` is chance.
+    `exact` moves every token exactly onto its target. `position only`, for one token, moves the
+    token onto the target's centre without a turn. `random` takes random actions.
     """
     found: dict[str, Callable[[Env], Chooser]] = {"exact": lambda _: exact_policy(layout, sim)}
     if layout.tokens == 1:

@@ -1,9 +1,9 @@
-"""A silhouette that is drawn, in a file or in the library -> its area, read without trust.
+"""Read the outline of a silhouette from an untrusted JSON file, or from the library.
 
-A file is a puzzle, whose pieces are forgotten, or JSON:
+A file is a puzzle, whose pieces are merged, or a list of outlines:
 {"format": "tangram-outlines", "version": 1, "outlines": [[[x, y], ...], ...], "side": 1},
-lengths in any unit, y up. An outline that lies in another is a hole in it. The side may be left
-out; it is that of the full square that the tans are cut from, and tells the scale.
+lengths in any unit, y up. An outline that lies in another is a hole. `side` gives the scale: it is
+the side of the full square that the tans are cut from. It may be left out.
 """
 
 from dataclasses import dataclass
@@ -36,20 +36,21 @@ FORMAT, VERSION = "tangram-outlines", 1
 MAX_OUTLINES = 100
 MIN_SIDE = 1e-6
 MAX_POINTS = 2_000  # corners of all outlines of a file
-# Pairs of sides that meet, but for neighbours: seven tans have less than a hundred. What shapely
-# makes of them takes more than their square.
+# Pairs of sides that meet, without neighbours: seven tans have less than a hundred. The time that
+# shapely needs grows faster than the square of their number.
 MAX_MEETINGS = 1_000
 _KEYS = {"format", "version", "outlines"}
-_SEAM = 0.004  # of the root of its area: gaps between drawn pieces that are closed
+_SEAM = 0.004  # of the root of the area: narrower gaps between drawn pieces are closed
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A silhouette as it is drawn.
+    """A silhouette and its scale.
 
     Attributes:
-        area: of it, around the origin.
-        side: of the full square that tans are cut from, in its units; None where it is not told.
+        area: the silhouette, around the origin.
+        side: side of the full square that the tans are cut from, in the area's unit; None if
+            unknown.
     """
 
     area: Area
@@ -57,14 +58,14 @@ class Drawn:
 
 
 def read_outline(name: str, source: str) -> Drawn:
-    """What a file draws, or a puzzle of the library.
+    """The silhouette of a file, or of a puzzle of the library.
 
     Args:
-        name: of the JSON file, or of the puzzle.
-        source: what errors call it.
+        name: path of the JSON file, or name of the puzzle.
+        source: name of the file or puzzle in errors.
 
     Raises:
-        ConfigError: it cannot be used.
+        ConfigError: the file or the puzzle cannot be used.
     """
     path, kind = Path(name), Path(name).suffix.lower()
     if kind != ".json":
@@ -80,7 +81,7 @@ def _only(text: str, source: str) -> Puzzle:
     found = parse_puzzles(text, source, PuzzleRules(1.0, subset=True))
     if len(found) != 1:
         raise ConfigError(
-            f"{source} has {len(found)} puzzles, and one silhouette is filled: take a file of one"
+            f"{source} has {len(found)} puzzles, but it must have one: use a file with one puzzle"
         )
     return found[0]
 
@@ -93,7 +94,7 @@ def _of_puzzle(puzzle: Puzzle, source: str) -> Drawn:
 def _of_outlines(content: dict[str, Any], source: str) -> Drawn:
     if set(content) - {"side"} != _KEYS:
         raise ConfigError(
-            f"{source} must be a mapping with the keys format, version, outlines, and perhaps "
+            f"{source} must be a mapping with the keys format, version, outlines, and optionally "
             f"side, got {shown(list(content))}"
         )
     check_format(content, FORMAT, VERSION, source)
@@ -121,7 +122,7 @@ def _ring(entry: Any, where: str) -> Floats:
 
 
 def _joined(rings: list[Floats], source: str) -> Area:
-    """One area of several outlines (V, 2); one that lies in another is a hole in it, and so on."""
+    """One area of several outlines (V, 2). One in another is a hole, one in a hole an island."""
     if sum(map(len, rings)) > MAX_POINTS:
         raise ConfigError(
             f"{source} has more than {MAX_POINTS} corners: draw straight sides, or give a PNG of it"
@@ -132,7 +133,7 @@ def _joined(rings: list[Floats], source: str) -> Area:
             "not cross, or give a PNG of it"
         )
     every = np.concatenate(rings)
-    # Far from the origin geometry would lose digits.
+    # Far from the origin, coordinates would lose digits.
     middle = (every.min(axis=0) + every.max(axis=0)) / 2.0
     valid = [shapely.make_valid(Polygon(ring - middle)) for ring in rings]
     inside = [sum(shapely.contains_properly(other, one) for other in valid) for one in valid]
@@ -149,7 +150,7 @@ def _joined(rings: list[Floats], source: str) -> Area:
 
 
 def _meetings(rings: list[Floats]) -> int:
-    """How many pairs of sides cross or touch, but for neighbours; counting ends beyond the most."""
+    """Count pairs of sides that meet, without neighbours; stop above MAX_MEETINGS."""
     ends = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]
     sides = shapely.linestrings(np.concatenate(ends))
     starts = np.cumsum([0, *map(len, rings)])

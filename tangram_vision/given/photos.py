@@ -1,10 +1,10 @@
-"""A photograph of tokens at an unknown scale -> where each of them lies.
+"""Find tokens, or a silhouette, in a photograph of unknown scale.
 
-The tokens are known, and all of them are in the picture: so the area that they cover tells the
-scale. Light may fall off smoothly towards any side, tokens may be darker than the ground or
-lighter, each by another amount; weak shadows are taken away.
+All tokens are known and are in the picture, so the area that they cover gives the scale. Light may
+fall off smoothly towards any side. Tokens may be darker or lighter than the ground, each by a
+different amount. Weak shadows are removed.
 
-Legend: H x W pixels of the photograph, P along a side of what is looked at, K tokens.
+Legend: H x W pixels of the photograph, P along a side of the part that is searched, K tokens.
 """
 
 from collections import Counter
@@ -24,30 +24,30 @@ from tangram_vision.pictures.kinds import kinds_of
 from tangram_vision.pictures.seeing import see
 from tangram_vision.silhouettes.tilts import from_above, shift
 
-# Along a side, at most, in which tokens are searched: the fewer, the less a skew matters.
+# Pixels along a side of the searched part, tried in turn: with fewer pixels a skew matters less.
 _PIXELS = (256, 128, 80)
-_SMALL = 6.0  # pixels: the root of the smallest token's area that is enough
-_SPOTS = 200  # areas that are looked at
-_DIRT = 0.4  # of the smallest token's share of all
+_SMALL = 6.0  # pixels: the root of the smallest token's area, at least
+_SPOTS = 200  # areas that are examined, at most
+_DIRT = 0.4  # of the smallest token's area: a smaller area is dirt
 _MARGIN = 8  # pixels around the tokens
 _AROUND = 3  # pixels around one area
-_MANY = 40  # areas whose shapes are told
-_SIZE = 1.6  # times that an area may be larger or smaller than the token that it looks like
-_LIKE = 0.25  # moments nearer than this make an area look like a token
-_CONTRAST = 40  # levels between ground and tokens; less is taken for noise, and
-_CLEAN = 12  # is enough where the ground has none
-_POINTS = 100  # of the light along a side
-_BORDER = 5  # points of the light from each side that show the ground
+_MANY = 40  # areas whose shapes an error lists, at most
+_SIZE = 1.6  # an area may be this many times larger or smaller than the token that it looks like
+_LIKE = 0.25  # distance of moments within which an area looks like a token
+_CONTRAST = 40  # levels between ground and tokens, at least, on uneven ground
+_CLEAN = 12  # the same on even ground
+_POINTS = 100  # samples of the light along a side
+_BORDER = 5  # samples at each side that show the ground
 _ROUNDS = 24
-_STEEP = 3.0  # how much steeper edges are made: less than a third is a shadow
+_STEEP = 3.0  # factor that makes edges steeper: less than a third of a token's level is a shadow
 _NOTHING = "no token alone"
 
 
 class LackingError(ConfigError):
-    """Not all tokens were found, or they are too small.
+    """Tokens are missing in a photograph, or too small.
 
     Attributes:
-        areas: that were seen apart.
+        areas: number of separate areas that were found.
     """
 
     def __init__(self, told: str, areas: int) -> None:
@@ -57,13 +57,13 @@ class LackingError(ConfigError):
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Tokens in a photograph.
+    """Poses of tokens in a photograph.
 
     Attributes:
         poses: (K, 3) x and y in arena units from the photograph's upper left corner, y up, and
             angle.
-        flipped: (K,) which lie on their other side.
-        unit: pixels of an arena unit.
+        flipped: (K,) whether a token is turned over.
+        unit: pixels in an arena unit.
     """
 
     poses: Floats
@@ -72,15 +72,15 @@ class Found:
 
 
 def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
-    """Where a photograph shows each of a layout's tokens.
+    """Find the pose of each token in a photograph.
 
     Args:
         picture: the photograph.
-        layout: its tokens.
-        source: what errors call the photograph.
+        layout: the tokens.
+        source: name of the photograph in errors.
 
     Raises:
-        ConfigError: says what was found instead.
+        ConfigError: tokens are missing or too small; says what was found instead.
     """
     cover = _coverage(picture)
     spots = _spots(cover, layout, source)
@@ -89,7 +89,7 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
     if smallest < _SMALL:
         raise LackingError(
             f"{source} shows tokens too small: the smallest is about {smallest:.1f} pixels wide, "
-            f"and {_SMALL:g} are needed: take it from nearer, or larger",
+            f"and {_SMALL:g} are needed: take it from nearer, or with more pixels",
             len(spots.boxes),
         )
     part, corner = spots.cut_out()
@@ -104,12 +104,12 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
 
 @dataclass(frozen=True, eq=False)
 class Shade:
-    """What a photograph shows of a silhouette.
+    """A silhouette in a photograph.
 
     Attributes:
-        cover: (P, P) coverage by it, of a square around it, as from straight above.
-        back: homography (3, 3) of the square's points, 0 to 1 to the right and down, to columns and
-            rows of the photograph.
+        cover: (P, P) coverage by the silhouette in a square around it, as from straight above.
+        back: homography (3, 3) from points of that square, 0 to 1 to the right and down, to columns
+            and rows of the photograph.
     """
 
     cover: Singles
@@ -117,21 +117,21 @@ class Shade:
 
 
 def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
-    """The silhouette that a photograph shows, of one part or of several.
+    """Find the silhouette in a photograph; it may have several parts.
 
     Args:
         picture: the photograph.
-        layout: the tokens that are to fill it.
-        source: what errors call the photograph.
+        layout: the tokens that will fill the silhouette.
+        source: name of the photograph in errors.
 
     Raises:
-        ConfigError: it shows none.
+        ConfigError: the photograph shows no silhouette, or cuts it off.
     """
     cover = _coverage(picture)
     spots = _spots(cover, layout, source)
     if spots.lacks:
         raise ConfigError(
-            f"{source} is cut off: a part of it reaches the picture's edge, leave ground around it"
+            f"{source} is cut off by the picture's edge: leave ground around the silhouette"
         )
     part, corner = spots.cut_out()
     above, back = from_above(part)
@@ -143,17 +143,17 @@ def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":
     """The areas of a photograph that may be tokens, or parts of a silhouette."""
     spots = _Spots.of(cover, float(layout.areas.min() / layout.areas.sum()))
     if not len(spots.boxes):
-        at_edge = f" but what reaches its edge ({spots.cut})" if spots.cut else ""
+        at_edge = f" except areas at its edge ({spots.cut})" if spots.cut else ""
         raise ConfigError(
             f"{source} shows nothing{at_edge} that is darker or lighter than its ground by "
-            f"{_CLEAN} of 255 levels, {_CONTRAST} where that is uneven: take it with dark "
+            f"{_CLEAN} of 255 levels ({_CONTRAST} on uneven ground): take it with dark "
             "tokens on light ground, or light ones on dark, and with ground all around"
         )
     return spots
 
 
 def _seen(cover: Singles, layout: Layout, view: float) -> Look | None:
-    """All tokens of a layout in a square of coverage that is so wide; None if some are missing."""
+    """All tokens in a square of coverage of width `view`; None if some are missing."""
     for pixels in _PIXELS:
         seen = see(_smaller(cover, pixels), layout, view)
         if seen.known.all():
@@ -162,13 +162,13 @@ def _seen(cover: Singles, layout: Layout, view: float) -> Look | None:
 
 
 def _smaller(cover: Singles, pixels: int) -> Singles:
-    """The same with at most so many pixels along a side."""
+    """The coverage with at most so many pixels along a side."""
     side = min(pixels, len(cover))
     return np.asarray(cv2.resize(cover, (side, side), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _told(cover: Singles, spots: "_Spots", layout: Layout, view: float) -> str:
-    """What was found where that is not what was looked for, and what to do."""
+    """The error for missing tokens: what was found, and what to do."""
     count = len(spots.boxes)
     edge = f" ({spots.cut} more at its edge left out)" if spots.cut else ""
     areas = "1 area" if count == 1 else f"{count} areas"
@@ -184,7 +184,7 @@ def _told(cover: Singles, spots: "_Spots", layout: Layout, view: float) -> str:
 
 
 def _looks(cover: Singles, layout: Layout, view: float) -> list[str]:
-    """What each area looks like, whether or not it is as large."""
+    """The shape that each area looks like, also if their sizes differ somewhat."""
     kinds = kinds_of(layout, view, len(cover))
     blobs = find_blobs(cover, _DIRT * min(kind.area for kind in kinds))
     far, _ = likeness(blobs.moments, kinds)
@@ -201,11 +201,11 @@ def _listed(names: list[str]) -> str:
     return ", ".join(f"{count} {name}" if count > 1 else name for name, count in counts)
 
 
-# What is covered
+# Coverage
 
 
 def _coverage(picture: Image.Image) -> Singles:
-    """(H, W) about 0 on the ground, and about 1 on tokens, each by its own level."""
+    """(H, W) about 0 on the ground and about 1 on tokens, whatever the level of each token."""
     grey, *colours = (_smooth(one) for one in (picture.convert("L"), *picture.split()))
     light, noise = _light(grey)
     contrast = _CONTRAST if noise > 1.0 else _CLEAN
@@ -215,7 +215,7 @@ def _coverage(picture: Image.Image) -> Singles:
     sign = np.float32(-1.0 if dark else 1.0)
     differs *= sign
     cover = np.zeros_like(differs)
-    # In a drawing yellow on white differs in blue alone, and a shadow has no colour.
+    # In a drawing, yellow on white differs in blue alone. A shadow has no colour.
     if noise <= 1.0 and (np.ptp(colours, axis=0) > contrast).any():
         each = [sign * (_light(colour)[0] - colour) for colour in colours]
         coloured = np.ptp(each, axis=0) > contrast
@@ -239,10 +239,10 @@ def _smooth(channel: Image.Image) -> Singles:
 
 
 def _light(grey: Singles) -> tuple[Singles, float]:
-    """(H, W) levels of a lit ground, and the deviation from it.
+    """(H, W) levels of the lit ground, and the noise around them.
 
-    A curved surface from which most of the picture's border is not far, and then all that it meets
-    within: a figure may cover most of the picture.
+    A curved surface is fitted to the picture's border, then to all pixels that are near to it.
+    So a figure may cover most of the picture.
     """
     step = max(1, max(grey.shape) // _POINTS)
     some = grey[::step, ::step].astype(np.float64)
@@ -280,10 +280,10 @@ class _Spots:
     """The areas of a photograph that may be tokens.
 
     Attributes:
-        cover: (H, W) coverage by them alone.
+        cover: (H, W) coverage by these areas alone.
         boxes: (N, 4) left, top, right and bottom of each.
-        cut: areas that reach the photograph's edge, and were left out.
-        lacks: whether one of these is as large as what counts.
+        cut: number of areas left out, because they reach the photograph's edge.
+        lacks: whether an area that was left out is too large for dirt.
     """
 
     cover: Singles
@@ -293,7 +293,7 @@ class _Spots:
 
     @staticmethod
     def of(cover: Singles, smallest: float) -> "_Spots":
-        """Those of coverage (H, W), the smallest token being such a share of all."""
+        """The areas of coverage (H, W); `smallest` is the smallest token's share of all tokens."""
         height, width = cover.shape
         _, label, stats, _ = cv2.connectedComponentsWithStats((cover > 0.5).astype(np.uint8))
         left, top, wide, high, count = stats.T

@@ -1,4 +1,4 @@
-"""A picture file that a person gives, read without trust -> a picture in colour."""
+"""Read an untrusted picture file as a picture in colour."""
 
 import struct
 import warnings
@@ -13,17 +13,17 @@ from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.sketches import check_file
 from tangram_vision.given.svg_files import read_svg
 
-# Those of them that Pillow reads by itself; EPS, say, starts another program.
+# Formats that Pillow reads by itself. EPS, for example, would start another program.
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "TIFF", "BMP", "AVIF", "PPM")
 READ = (
     *(".png", ".jpg", ".jpeg", ".webp", ".gif", ".tif", ".tiff", ".bmp", ".avif", ".ppm", ".svg"),
 )
 MAX_MEGAPIXELS = 64
 MIN_SIDE = 32
-LONGEST = 1280  # pixels of the longer side that are looked at
-_PAPER, _SLATE = (255, 255, 255), (0, 0, 0)  # behind what is transparent and dark, and light
-_LIGHT = 200  # mean level of what is light
-# What Pillow raises where a file is not what it says.
+LONGEST = 1280  # pixels along the longer side; a larger picture is reduced
+_PAPER, _SLATE = (255, 255, 255), (0, 0, 0)  # ground of a dark, and of a light transparent picture
+_LIGHT = 200  # mean level from which a picture is light
+# Errors of Pillow for broken files.
 _BROKEN = (
     OSError,
     SyntaxError,
@@ -37,12 +37,12 @@ _BROKEN = (
 
 
 class Given(NamedTuple):
-    """A file's picture.
+    """The picture of a file.
 
     Attributes:
-        picture: in colour, upright, at most LONGEST pixels along its longer side.
+        picture: the picture in colour, upright, at most LONGEST pixels along its longer side.
         size: width and height of the file's own page.
-        own: homography (3, 3) of points of the picture to points of that page.
+        own: homography (3, 3) from points of the picture to points of that page.
     """
 
     picture: Image.Image
@@ -51,14 +51,15 @@ class Given(NamedTuple):
 
 
 def read_picture(path: Path, source: str) -> Given:
-    """A file's picture, and where it lies in the file.
+    """Read a picture, and its position in the file's page.
 
     Args:
-        path: of the file.
-        source: what errors call it.
+        path: path of the file.
+        source: name of the file in errors.
 
     Raises:
-        ConfigError: no file, none of `FORMATS` or SVG that can be read, too large or too small.
+        ConfigError: the file is missing, broken, too large or too small, or is neither an SVG nor
+            one of `FORMATS`.
     """
     check_file(path, source)
     if path.suffix.lower() == ".svg":
@@ -94,13 +95,13 @@ def _check_size(image: Image.Image, source: str) -> None:
         raise ConfigError(_too_large(source))
     if min(width, height) < MIN_SIDE:
         raise ConfigError(
-            f"{source} has {width} x {height} pixels, and at least {MIN_SIDE} along each side are "
+            f"{source} has {width} x {height} pixels, but at least {MIN_SIDE} along each side are "
             "needed: take a larger picture"
         )
 
 
 def _upright(image: Image.Image) -> tuple[Image.Image, Floats]:
-    """In colour, small enough; and the homography of its points to those before it was small."""
+    """The image in colour, upright and reduced; and the homography to its unreduced points."""
     if image.mode[0] in "IF":  # grey of more than 8 bits
         levels = np.nan_to_num(np.asarray(image, np.float64))
         levels -= levels.min()

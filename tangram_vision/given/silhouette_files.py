@@ -1,7 +1,7 @@
-"""A silhouette from a file or by name -> where a layout's tokens lie that fill it.
+"""Read a silhouette from a file, or by name, and fill it with a layout's tokens.
 
-A file is a picture of it, dark on light or the reverse, or tells its outline. Its place and its
-angle are free, and so is its scale: the area tells it, also where a file tells another.
+A file holds a picture, dark on light or the reverse, or an outline. Place, angle and scale of the
+silhouette are free: its area is scaled to that of the tokens, even if a file gives another scale.
 
 Legend: H x W pixels of a picture.
 """
@@ -29,26 +29,27 @@ from tangram_vision.silhouettes.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes.silhouettes import Filled, fill_outline
 from tangram_vision.silhouettes.tilts import mapped, shift
 
-_DRAWN = 640  # pixels along the longer side of an outline that is drawn
-_BORDER = 0.1  # of it, around the outline
+_DRAWN = 640  # pixels along the longer side of an outline's picture
+_BORDER = 0.1  # of the outline's longer side, around the outline
 _INK, _PAPER = (55, 60, 68), (250, 250, 247)
-_LINES = 4  # times as much as is drawn lies within lines; of tans around a hole less
-_OFF = 0.05  # of the tokens' area, by which that of a drawing of known scale may be wrong
+_LINES = 4  # a line drawing encloses this many times its own area; tans around a hole, less
+_OFF = 0.05  # of the tokens' area: error of the area of a drawing of known scale, at most
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """What a file showed, and how tokens fill it.
+    """A silhouette from a file, and how tokens fill it.
 
     Attributes:
-        picture: of it, in colour.
-        mask: (H, W) which of its pixels are the silhouette's.
-        filled: how, or how it was tried; poses are in the units of the layout.
-        drawing: homography (3, 3) of points in such units to columns and rows of the picture.
-        area: of it, in such units.
-        share: its area over that of the tokens where the file tells its scale, and they differ.
-        page: width and height of the file's own page; of outlines it is the picture.
-        own: homography (3, 3) of points of the picture to points of that page.
+        picture: the silhouette in colour.
+        mask: (H, W) which pixels of the picture belong to the silhouette.
+        filled: the filling, or the attempt; poses are in the units of the layout.
+        drawing: homography (3, 3) from points in these units to columns and rows of the picture.
+        area: the silhouette, in these units.
+        share: area of the file's silhouette over that of the tokens; None if the file gives no
+            scale, or if both areas agree.
+        page: width and height of the file's own page; for outlines, those of the picture.
+        own: homography (3, 3) from points of the picture to points of that page.
     """
 
     picture: Image.Image
@@ -61,7 +62,7 @@ class Silhouette:
     own: Floats
 
     def corners(self, layout: Layout, found: Dissection) -> Floats:
-        """(V, 2) of the tokens, columns and rows of the picture."""
+        """(V, 2) corners of the tokens, in columns and rows of the picture."""
         return mapped(self.drawing, layout.corners(found.poses, found.flipped))
 
 
@@ -71,14 +72,14 @@ def fill_silhouette(
     """Read a silhouette and fill it.
 
     Args:
-        name: of a file, or of a puzzle of the library.
-        source: what errors call it.
+        name: path of a file, or name of a puzzle of the library.
+        source: name of the file in errors.
         layout: the tokens.
-        scale: side of the full square that they are cut from, in their units.
-        seconds: for the search.
+        scale: side of the full square that the tokens are cut from, in units of the layout.
+        seconds: processor time for the search.
 
     Raises:
-        ConfigError: a file that cannot be used; whether it was filled is not checked.
+        ConfigError: the file cannot be used. A silhouette that was not filled is no error.
     """
     path = Path(name)
     if path.suffix.lower() in ("", ".json"):
@@ -87,7 +88,7 @@ def fill_silhouette(
 
 
 def _from_outline(drawn: Drawn, layout: Layout, scale: float, seconds: float) -> Silhouette:
-    """Scaled to the tokens' area, filled, and drawn."""
+    """Scale an outline to the tokens' area, fill it, and draw its picture."""
     area, total = drawn.area, float(layout.areas.sum())
     own = float(np.sqrt(total / area.area))
     share = None if drawn.side is None else float(area.area * (scale / drawn.side) ** 2 / total)
@@ -101,7 +102,7 @@ def _from_outline(drawn: Drawn, layout: Layout, scale: float, seconds: float) ->
 
 
 def _framed(area: Area, scale: float) -> tuple[Area, tuple[int, int], float]:
-    """An area so many times as large in a picture, its width and height, and pixels of a unit."""
+    """The area scaled and moved into a picture; the picture's size, and pixels in a unit."""
     low_x, low_y, high_x, high_y = area.bounds
     border = _BORDER * max(high_x - low_x, high_y - low_y)
     width, height = high_x - low_x + 2.0 * border, high_y - low_y + 2.0 * border
@@ -118,7 +119,7 @@ def _framed(area: Area, scale: float) -> tuple[Area, tuple[int, int], float]:
 def _mask(area: Area, size: tuple[int, int], unit: float) -> Bools:
     canvas = Image.new("1", size)
     brush = ImageDraw.Draw(canvas)
-    # What lies in a hole is smaller than what has the hole, and is drawn after it.
+    # A part in a hole is smaller than the part with the hole, and must be drawn after it.
     for part in sorted(shapely.get_parts(area).tolist(), key=lambda part: -part.area):
         for ring, ink in ((part.exterior, 1), *((hole, 0) for hole in part.interiors)):
             points = np.asarray(ring.coords) * (unit, -unit)
@@ -131,7 +132,7 @@ def _inked(mask: Bools) -> Image.Image:
 
 
 def _from_picture(given: Given, source: str, layout: Layout, seconds: float) -> Silhouette:
-    """The scale is that at which as many pixels are covered as the tokens are large."""
+    """Fill the silhouette in a picture, at the scale that gives it the tokens' area."""
     shade = _closed(find_silhouette(given.picture, layout, source))
     if not (shade.cover > 0.5).any():
         raise ConfigError(
@@ -147,7 +148,7 @@ def _from_picture(given: Given, source: str, layout: Layout, seconds: float) -> 
 
 
 def _closed(shade: Shade) -> Shade:
-    """What a figure that is drawn by lines alone encloses; any other as it is."""
+    """The filled figure, if lines alone draw it; any other figure unchanged."""
     mask = (shade.cover > 0.5).astype(np.uint8)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     whole = cv2.drawContours(np.zeros_like(mask), contours, -1, 1, cv2.FILLED)
@@ -159,7 +160,7 @@ def _closed(shade: Shade) -> Shade:
 
 
 def _traced(cover: Singles, unit: float) -> Area:
-    """What coverage (P, P) shows along its half level, a pixel being so large, y up."""
+    """The area where coverage (P, P) is above 0.5; `unit` is a pixel's width, y up."""
     levels = np.pad(cover, 1)  # so that every line is closed
     middles = np.arange(len(levels)) - 0.5
     lines = contourpy.contour_generator(middles, middles, levels).lines(0.5)
@@ -170,8 +171,8 @@ def _traced(cover: Singles, unit: float) -> Area:
 
 
 def _shaded(shade: Shade, size: tuple[int, int]) -> Bools:
-    """(H, W) where a photograph of such a width and height shows the silhouette."""
+    """(H, W) whether a pixel of the photograph, of `size` W x H, shows the silhouette."""
     pixels = 1.0 / len(shade.cover)
-    # OpenCV has the middle of a pixel at whole numbers.
+    # In OpenCV the centres of pixels are whole numbers.
     matrix = shift(-0.5, -0.5) @ shade.back @ np.diag([pixels, pixels, 1.0]) @ shift(0.5, 0.5)
     return np.asarray(cv2.warpPerspective(shade.cover, matrix, size)) > 0.5

@@ -1,7 +1,7 @@
-"""A drawing as SVG, read without trust -> a picture of what it shows, by resvg.
+"""Draw an untrusted SVG file with resvg.
 
-resvg is a fast program, not a wary one: a small file can keep it busy for minutes, or end it. So it
-draws in a process of its own, with little time and memory.
+resvg is fast, but a small hostile file can keep it busy for minutes, or crash it. So it runs in a
+process of its own, with limits on time and memory.
 """
 
 import base64
@@ -20,13 +20,13 @@ from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.sketches import read_text
 from tangram_vision.silhouettes.tilts import shift
 
-SIDE = 2400  # pixels of a square that the whole drawing goes into
-SECONDS, BYTES = 10, 2 << 30  # that drawing may take
-_BORDER = SIDE // 8  # around it
-_SLACK = 3.0  # pixels beyond the page that are none
+SIDE = 2400  # pixels along the square that the drawing is fitted into
+SECONDS, BYTES = 10, 2 << 30  # limits for resvg
+_BORDER = SIDE // 8  # pixels around the drawing
+_SLACK = 3.0  # pixels beyond the page that do not count
 _SEEN = 24  # levels of any colour by which a figure differs from its ground
 _REFUSED = {"text": "convert it to paths", "image": "give the picture itself"}
-# As a picture in another one it stays within this size, and reads no other file.
+# An SVG within another one as an image keeps this size, and cannot read other files.
 _FRAME = (
     '<svg xmlns="http://www.w3.org/2000/svg" width="{side}" height="{side}"><image width="{side}" '
     'height="{side}" href="data:image/svg+xml;base64,{content}"/></svg>'
@@ -43,15 +43,15 @@ sys.stdout.buffer.write(bytes(drawn))
 
 
 def read_svg(path: Path, source: str) -> tuple[Image.Image, tuple[float, float], Floats]:
-    """What a file draws, black on white, with a border around it.
+    """Draw an SVG file in black on white, with a border.
 
     Returns:
         The picture; width and height of the page, in units of its viewBox; and the homography
-        (3, 3) of points of the picture to those of the page, from its upper left corner. If the
-        page is not told in numbers, or stretched, it is the picture itself.
+        (3, 3) from points of the picture to points of the page, whose origin is its upper left
+        corner. If the page has no size in numbers, or is stretched, the picture is the page.
 
     Raises:
-        ConfigError: it cannot be used, and why.
+        ConfigError: the file cannot be used; says why.
     """
     text = read_text(path, source)
     root = _checked(text, source)
@@ -64,7 +64,7 @@ def read_svg(path: Path, source: str) -> tuple[Image.Image, tuple[float, float],
     told = [re.match(r"\d+(\.\d+)?(?!.*%)", root.get(name, "")) for name in ("width", "height")]
     shown = pixels[top : low + 1, left : right + 1]
     figure = _figure(shown)
-    # A page of another colour than white would be a figure itself.
+    # A page of another colour than white would itself look like a figure.
     opaque = max(shown.shape[:2]) >= SIDE - 1 and shown[..., 3].all()
     if not (opaque and (shown[0, 0, :3] < 256 - _SEEN).any()) and _reaches_out(root, page, source):
         raise ConfigError(
@@ -79,16 +79,16 @@ def read_svg(path: Path, source: str) -> tuple[Image.Image, tuple[float, float],
     if not np.isclose(wide * height, high * width, rtol=0.01):  # stretched, or with more around it
         return picture, picture.size, np.eye(3)
     unit = SIDE / max(width, height)
-    # The page has its middle in that of the square.
+    # The page is centred in the square.
     right, down = np.array([left, top]) - _BORDER - SIDE / 2.0 + unit * page[2:] / 2.0
     return picture, (width, height), np.diag([1.0 / unit, 1.0 / unit, 1.0]) @ shift(right, down)
 
 
 def _figure(pixels: AnyArray) -> AnyArray:
-    """(H, W) which pixels (H, W, 4) are not of the ground.
+    """(H, W) whether pixels (H, W, 4) belong to the figure.
 
-    The ground is the one colour all around an opaque drawing, else white; if all is white on
-    nothing, that is the figure.
+    The ground is the colour around an opaque drawing, if that is one colour; otherwise white. A
+    drawing that is all white on a transparent ground is the figure.
     """
     colour, there = pixels[..., :3].astype(np.int64), pixels[..., 3] > 127
     rim = np.concatenate([colour[0], colour[-1], colour[:, 0], colour[:, -1]])
@@ -101,7 +101,7 @@ def _figure(pixels: AnyArray) -> AnyArray:
 
 
 def _drawn(text: str, source: str) -> AnyArray:
-    """(SIDE, SIDE, 4) colours and how opaque they are."""
+    """(SIDE, SIDE, 4) colours and opacity."""
     frame = _FRAME.format(side=SIDE, content=base64.b64encode(text.encode()).decode())
     command = [sys.executable, "-I", "-c", _DRAW, str(BYTES), str(SECONDS)]
     try:
@@ -114,15 +114,15 @@ def _drawn(text: str, source: str) -> AnyArray:
                 f"{source} needs resvg, which is missing: pip install resvg-py"
             ) from None
         raise ConfigError(
-            f"{source} cannot be drawn in {SECONDS} s and {BYTES >> 30} GB: take away its filters "
-            "and groups within groups, or give a PNG of it"
+            f"{source} cannot be drawn in {SECONDS} s and {BYTES >> 30} GB: remove its filters "
+            "and nested groups, or give a PNG of it"
         ) from None
     drawn: AnyArray = np.asarray(Image.open(BytesIO(done.stdout)).convert("RGBA"))
     return drawn
 
 
 def _page(root: ET.Element) -> Floats | None:
-    """(4,) left, top, width and height of the page in its own units; None if it does not tell."""
+    """(4,) left, top, width and height of the page in its own units; None if unknown."""
     told = root.get("viewBox") or "0 0 {} {}".format(
         *((root.get(name) or "").removesuffix("px") for name in ("width", "height"))
     )
@@ -135,9 +135,9 @@ def _page(root: ET.Element) -> Floats | None:
 
 
 def _reaches_out(root: ET.Element, page: Floats | None, source: str) -> bool:
-    """Whether something is drawn beyond the page, without a rectangle that covers the page.
+    """Whether something is drawn beyond the page; a rectangle that covers the page is ignored.
 
-    Not known, so no, where the page is not told in numbers or something is sized by it.
+    False, too, if that is unknown: the page has no size in numbers, or other sizes depend on it.
     """
     if page is None:
         return False
@@ -160,10 +160,10 @@ def _reaches_out(root: ET.Element, page: Floats | None, source: str) -> bool:
 
 
 def _checked(text: str, source: str) -> ET.Element:
-    """The root of what can be drawn.
+    """The root of an SVG that can be drawn.
 
     Raises:
-        ConfigError: it is no SVG, or is drawn otherwise elsewhere, as text is by other fonts.
+        ConfigError: the text is no SVG, or looks different elsewhere, as text with other fonts.
     """
     if re.search(r"<!\s*(doctype[^<>]*\[|entity)", text, re.IGNORECASE):
         raise ConfigError(
@@ -171,7 +171,7 @@ def _checked(text: str, source: str) -> ET.Element:
             "stands for, then delete them, or give a PNG of it"
         )
     try:
-        # Entities are the danger of XML, and none can be defined without a [...] of DOCTYPE.
+        # Only entities make XML dangerous, and none can be defined without DOCTYPE [...].
         root = ET.fromstring(text)  # noqa: S314
     except (ET.ParseError, ValueError) as error:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""A picture from straight above -> where each token lies, and whether that is sure.
+"""Find each token in a picture from straight above, and whether its pose is certain.
 
 Start with `seeing.py`. Imports no other folder of tangram_vision.
 """

@@ -1,4 +1,4 @@
-"""Connected areas of coverage, and which shape each looks like by its moments."""
+"""Connected areas of coverage ("blobs"), and their likeness to shapes by moments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,24 +9,24 @@ import numpy as np
 from tangram_core.arrays import Bools, Complex, Floats, Ints, Singles
 from tangram_vision.pictures.kinds import ORDERS, POWERS, Kind
 
-_HALO = 3.0  # pixels around a blob that may still show a part of it
-_MOST_ROWS = 32767  # of all blobs below each other: OpenCV looks into no taller picture
+_HALO = 3.0  # pixels around a blob that may still belong to it
+_MOST_ROWS = 32767  # of all blobs stacked: OpenCV samples no taller picture
 _TURNS: Floats = np.linspace(-np.pi, np.pi, 120, endpoint=False)
 _TURNED: Complex = np.exp(1j * _TURNS[:, None] * ORDERS)
-# Higher moments tell less and are noisier.
+# Higher moments are noisier, and count less.
 _WEIGHTS: Floats = np.array([4.0, 6.0, 4.0, 3.0, 3.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """N blobs.
+    """N connected areas of a picture.
 
     Attributes:
         cover: (N * P, P) coverage by each blob alone, one picture below the other.
-        area: (N,) square pixels.
-        centre: (N,) x + iy, pixels, y up from the upper left corner.
-        moments: (N, F), see kinds.py.
-        cut: (N,) which reach the picture's edge.
+        area: (N,) areas in square pixels.
+        centre: (N,) centres x + iy in pixels from the upper left corner, y up.
+        moments: (N, F) moments, see kinds.py.
+        cut: (N,) whether a blob reaches the picture's edge.
     """
 
     cover: Singles
@@ -40,15 +40,15 @@ class Blobs:
 
     @property
     def base(self) -> Ints:
-        """(N,) the row of `cover` at which each begins."""
+        """(N,) the first row of each blob in `cover`."""
         rows: Ints = np.arange(len(self)) * self.cover.shape[1]
         return rows
 
 
 def find_blobs(cover: Singles, smallest: float) -> Blobs:
-    """The blobs of coverage (P, P) of at least so many square pixels, the largest first.
+    """The blobs of coverage (P, P) of at least `smallest` square pixels, the largest first.
 
-    So many that no tokens could be are left out.
+    The number of blobs is limited; the limit is far above any number of tokens.
     """
     pixels = len(cover)
     ground = (cover < 0.5).astype(np.uint8)
@@ -82,11 +82,11 @@ def find_blobs(cover: Singles, smallest: float) -> Blobs:
 
 
 def likeness(moments: Complex, kinds: Sequence[Kind]) -> tuple[Floats, Floats]:
-    """How far blobs are from kinds by their moments, and the turns at which they are nearest.
+    """Distances between moments of blobs and kinds, and the turns that make them smallest.
 
     Args:
-        moments: (N, F) of blobs.
-        kinds: S.
+        moments: (N, F) moments of the blobs.
+        kinds: S kinds.
 
     Returns:
         (N, S) distances, 0 for the shape itself, and (N, S) turns in radians.

@@ -1,7 +1,7 @@
-"""Poses of tokens from the places where pictures turn from ground to token: to parts of a pixel.
+"""Refine poses of tokens by their edges in a picture, to a fraction of a pixel.
 
-Along a short line across an edge, what is covered says where the edge is, whatever blurs it. All
-lines of a token together are a least-squares problem in x, y and turn.
+On a short line across an edge, the covered length gives the position of the edge, even if it is
+blurred. All lines of a token together are a least-squares problem in x, y and turn.
 """
 
 from collections.abc import Sequence
@@ -12,16 +12,16 @@ import numpy as np
 from tangram_core.arrays import Bools, Floats, Ints, Singles
 from tangram_vision.pictures.kinds import Kind, lines_of
 
-WIDE, NARROW = 3.0, 2.0  # pixels that lines reach, at first and in the end
+WIDE, NARROW = 3.0, 2.0  # pixels of a line on each side of an edge, at first and at last
 _ROUNDS = (WIDE, WIDE, WIDE, NARROW, NARROW)
 
 
 class Outlines:
-    """The lines of several tokens at once.
+    """Short lines across the edges of several tokens.
 
     Attributes:
         z: (M, J) samples of all lines, as complex numbers in the body frame of their tokens.
-        owner: (M,) number of the token.
+        owner: (M,) number of each line's token.
     """
 
     def __init__(self, kinds: Sequence[Kind], reach: float) -> None:
@@ -36,13 +36,13 @@ class Outlines:
         self._counts = np.array(counts)
 
     def off(self, poses: Floats, cover: Singles, base: Ints) -> Floats:
-        """(M,) pixels by which each line is covered more than expected.
+        """(M,) covered length of each line minus the expected length, in pixels.
 
         Args:
-            poses: (N, 3) of the tokens, x and y in pixels from the picture's upper left corner,
-                y up.
+            poses: (N, 3) poses of the tokens; x and y in pixels from the picture's upper left
+                corner, y up.
             cover: pictures (P, P) of coverage, one below the other.
-            base: (N,) the row at which the picture of a token begins.
+            base: (N,) first row of each token's picture.
         """
         pixels = cover.shape[1]
         place = (poses[:, 0] + 1j * poses[:, 1])[self.owner]
@@ -54,17 +54,17 @@ class Outlines:
         return off
 
     def move(self, poses: Floats, off: Floats) -> Floats:
-        """Poses (N, 3) after the least-squares step for what lines are off (M,)."""
+        """Poses (N, 3) after one least-squares step; `off` (M,) holds the errors of the lines."""
         step = np.add.reduceat(self._solve * off, self._starts, axis=1).T
         return self._stepped(poses, step)
 
     def move_seen(self, poses: Floats, off: Floats, seen: Bools) -> Floats:
-        """The same by the lines that are seen (M,) alone."""
+        """Poses (N, 3) after a least-squares step by visible lines alone, where `seen` (M,)."""
         change = self.change * seen[:, None]
         matrix = np.add.reduceat(change[:, :, None] * change[:, None], self._starts, axis=0)
         right = np.add.reduceat(change * off[:, None], self._starts, axis=0)
         trace = np.trace(matrix, axis1=1, axis2=2)
-        # A little stiffness where an edge alone is seen: along it nothing is known.
+        # Regularised: if only one edge is seen, the position along it is unknown.
         matrix += (1e-3 * trace + 1e-9)[:, None, None] * np.eye(3)
         return self._stepped(poses, np.linalg.solve(matrix, right[..., None])[..., 0])
 
@@ -74,7 +74,7 @@ class Outlines:
         return stepped
 
     def spread(self, off: Floats) -> Floats:
-        """(N,) root mean square of what lines are off, pixels."""
+        """(N,) root mean square of each token's line errors, in pixels."""
         squares: Floats = np.sqrt(np.add.reduceat(off**2, self._starts) / self._counts)
         return squares
 
@@ -82,7 +82,7 @@ class Outlines:
 def refined(
     kinds: Sequence[Kind], poses: Floats, cover: Singles, base: Ints
 ) -> tuple[Floats, Floats]:
-    """Poses (N, 3) from rough ones, and what their lines are off then (N,); see `Outlines.off`."""
+    """Refined poses (N, 3) from rough ones, and their remaining errors (N,) in pixels."""
     outlines = {reach: Outlines(kinds, reach) for reach in set(_ROUNDS)}
     for reach in _ROUNDS:
         lines = outlines[reach]

@@ -1,7 +1,7 @@
-"""What a shape looks like: its moments, and how it covers short lines across its edges.
+"""The look of a shape in a picture: its moments, and the coverage of short lines across its edges.
 
-Legend: as in seeing.py; S kinds, F moments, M lines across edges, J samples on each. Everything
-here is in pixels, x to the right and y up, in the body frame of a shape.
+Legend: as in seeing.py; S kinds, F moments, M lines across edges, J samples on each. All lengths
+are in pixels, x to the right and y up, in the body frame of a shape.
 """
 
 from dataclasses import dataclass
@@ -13,25 +13,25 @@ from tangram_core.arrays import Complex, Floats, Ints
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.sides import Side, sides_of
 
-# Moments z^a conj(z)^b: a turn by t multiplies one by e^(i (a - b) t).
+# Moments z^a conj(z)^b: a turn by t multiplies a moment by e^(i (a - b) t).
 POWERS = ((2, 0), (3, 0), (4, 0), (2, 1), (3, 1))
 ORDERS: Ints = np.array([a - b for a, b in POWERS])
 _STEP = 0.5  # pixels between samples of a line
 _CORNER = 1.0  # pixels of an edge beside a corner where no line crosses it
-_SHIFT = 0.25  # pixels, of the differences that tell how lines change with the pose
-_GRID = 24  # subdivisions of a triangle that moments are summed over
+_SHIFT = 0.25  # pixels: step of the finite differences with respect to the pose
+_GRID = 24  # parts of a triangle's side, for sums over its area
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Lines across a shape's edges, each as long outside as inside.
+    """Lines across a shape's edges, as long outside the shape as inside.
 
     Attributes:
-        x, y: (M, J) of their samples.
-        expected: (M,) pixels of each that the shape covers.
-        change: (M, 3) how that changes where the shape moves by x, y (pixels) and turns (rad), seen
-            in its body frame; the lines stay.
-        solve: (3, M) the least-squares move for a change.
+        x, y: (M, J) coordinates of the samples.
+        expected: (M,) length of each line that the shape covers, in pixels.
+        change: (M, 3) derivative of that length when the shape moves by x, y (pixels) and turns
+            (rad) in its body frame, while the lines stay.
+        solve: (3, M) pseudo-inverse of `change`: errors of the lines to the least-squares move.
     """
 
     x: Floats
@@ -43,24 +43,24 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Kind(Side):
-    """A shape on one of its sides, in pixels.
+    """A shape with one of its sides up, in pixels.
 
     Attributes:
-        moments: (F,) over area and its root to the moment's degree.
+        moments: (F,) moments, divided by powers of the area so that size does not matter.
     """
 
     moments: Complex
 
     @cached_property
     def perimeter(self) -> float:
-        """Pixels."""
+        """Perimeter in pixels."""
         z = self.corners @ (1.0, 1j)
         return float(np.abs(np.roll(z, -1) - z).sum())
 
 
 @lru_cache(maxsize=8)
 def kinds_of(layout: Layout, arena: float, pixels: int) -> tuple[Kind, ...]:
-    """All different shapes of a layout as pictures show them, chiral ones on both sides."""
+    """The distinct shapes of a layout in pixels; chiral shapes with either side up."""
     unit = pixels / arena
     kinds = []
     for side in sides_of(layout):
@@ -73,7 +73,7 @@ def kinds_of(layout: Layout, arena: float, pixels: int) -> tuple[Kind, ...]:
 
 
 def moments_of(z: Complex, weight: Floats, area: float) -> Complex:
-    """(F,) moments of points (M,) around their centre, of any size."""
+    """(F,) moments of weighted points (M,) around the origin, independent of their size."""
     return np.array(
         [(weight * z**a * z.conj() ** b).sum() / area ** (1 + (a + b) / 2) for a, b in POWERS]
     )
@@ -94,7 +94,7 @@ def _filled(corners: Floats) -> tuple[Complex, Floats]:
 
 @lru_cache(maxsize=64)
 def lines_of(kind: Kind, reach: float) -> Lines:
-    """The lines that reach so many pixels in and out."""
+    """Lines across a kind's edges that reach `reach` pixels in and out."""
     offset = np.arange(-reach, reach + _STEP / 2, _STEP)
     xs, ys = [], []
     for start, end in zip(kind.corners, np.roll(kind.corners, -1, axis=0), strict=True):
@@ -121,7 +121,7 @@ def lines_of(kind: Kind, reach: float) -> Lines:
 
 
 def _covered(corners: Floats, x: Floats, y: Floats, move: Floats) -> Floats:
-    """(M,) pixels of lines that a polygon covers which is moved by x, y and turn."""
+    """(M,) length of lines covered by a polygon after a move by x, y and turn, in pixels."""
     z = (x - move[0] + 1j * (y - move[1])) * np.exp(-1j * move[2])
     level = np.ones(x.shape)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):

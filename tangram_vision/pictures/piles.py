@@ -1,9 +1,9 @@
-"""Tokens that touch show one outline together: which tokens, and where, is searched.
+"""Search for touching tokens ("a pile") that explain one common outline.
 
-At a convex corner of an outline some token has a corner of its own, with an edge along a side of
-it. Each token, each of its corners and both sides are tried; those that stay inside and explain
-most of the outline are taken away, until what is left is a token itself. Then all poses together
-are fitted to all pixels, and what pixels still differ judges.
+At a convex corner of the outline some token has a corner, too, with an edge along a side of the
+outline. The search tries each token, each of its corners and both sides. A token that stays inside
+and explains most of the outline is subtracted, until the rest is a single token. Then all poses
+are fitted to all pixels together. The remaining difference of the pixels ranks the arrangements.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,20 +21,20 @@ from tangram_vision.pictures.kinds import Kind
 from tangram_vision.pictures.ramps import fitted, ramps, unlike
 
 _TRIED = 120  # corner fits that are refined
-_BEAM = (10, 6, 4)  # of those followed, by the number of tokens laid before
-_LEAVES = 8  # whole arrangements that are compared
+_BEAM = (10, 6, 4)  # refined fits that are followed, by the number of tokens laid before
+_LEAVES = 8  # complete arrangements that are compared
 _MOST_STEPS = 40  # outlines whose corners are tried
-_GOOD, _MORE_STEPS = 0.02, 4  # what differs in an arrangement after which few more are tried
-_UNLIKE = 0.5  # share of a pile's area that differs before its poses are fitted
-_OUTSIDE = 0.2  # share of a token that may lie outside of an outline, a third of it when refined
-_AREA = 0.3  # pixels along a perimeter by which an area may be wrong
+_GOOD, _MORE_STEPS = 0.02, 4  # an arrangement that differs so little allows so many more steps
+_UNLIKE = 0.5  # share of a pile's area that may differ before its poses are fitted
+_OUTSIDE = 0.2  # share of a token that may lie outside the outline; a third of it when refined
+_AREA = 0.3  # error of an area over its perimeter, in pixels
 _FLAT = np.radians(165.0)
 _SLACK = np.radians(25.0)
-_RUGGED = 1.2  # pixels that an outline may leave its polygon
+_RUGGED = 1.2  # pixels between an outline and its polygon, at most
 _ROUNDS = (WIDE, WIDE, NARROW)
-_BEYOND = 40  # pixels around a picture in which a token that reaches out of it may lie
+_BEYOND = 40  # pixels around a picture where the rest of a cut-off token may lie
 _SHOWN = 0.6  # share of such a token that must be seen
-_FEW = 3  # of its fits that are compared
+_FEW = 3  # fits of such a token that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +42,9 @@ class Laid:
     """Tokens that explain a pile.
 
     Attributes:
-        kinds: numbers in the list of kinds.
+        kinds: indices into the list of kinds.
         poses: (n, 3), pixels from the picture's upper left corner, y up.
-        differs: share of the pile's area that they explain otherwise than the picture has it.
+        differs: share of the pile's area in which tokens and picture differ.
     """
 
     kinds: tuple[int, ...]
@@ -53,12 +53,12 @@ class Laid:
 
 
 def arrangements(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> list[Laid]:
-    """Different arrangements that explain a pile, the best first; empty if none was found.
+    """Distinct arrangements of tokens that explain a pile, the best first; empty if none is found.
 
     Args:
         cover: (P, P) coverage by the pile alone.
-        kinds: all of the layout.
-        left: how many tokens there are of each of their shapes.
+        kinds: all kinds of the layout.
+        left: number of available tokens of each shape.
     """
     rows, columns = (np.flatnonzero((cover > 0.5).any(axis=axis)) for axis in (1, 0))
     top, begin = max(0, rows[0] - 5), max(0, columns[0] - 5)
@@ -85,12 +85,12 @@ def arrangements(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> 
 
 
 def reaching_out(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> list[Laid]:
-    """Single tokens that explain what reaches beyond the picture, the best first.
+    """Single tokens that explain a blob cut off by the picture's edge, the best first.
 
     Args:
-        cover: (P, P) coverage by it alone, the whole picture.
-        kinds: all of the layout.
-        left: how many tokens there are of each of their shapes.
+        cover: (P, P) coverage by the blob alone, in the whole picture.
+        kinds: all kinds of the layout.
+        left: number of available tokens of each shape.
     """
     search, found = _Search(cover, kinds, _BEYOND), list[Laid]()
     for name, rough in search.corners(cover, float(cover.sum()) / _SHOWN, tuple(left))[:_FEW]:
@@ -101,26 +101,26 @@ def reaching_out(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> 
 
 
 class _Search:
-    """Depth first, the best token next, over what is left of one pile (P, P).
+    """Depth-first search that takes tokens out of one pile (P, P), the best token first.
 
     Attributes:
         steps: outlines whose corners were tried.
     """
 
     def __init__(self, cover: Singles, kinds: Sequence[Kind], beyond: int = 0) -> None:
-        """Search a pile.
+        """Prepare the search of a pile.
 
         Args:
-            cover: of it.
-            kinds: of which it is.
-            beyond: pixels around the picture in which it may go on.
+            cover: coverage by the pile.
+            kinds: kinds that the pile may contain.
+            beyond: pixels around the picture where the pile may continue.
         """
         self._cover, self._kinds, self._beyond = cover, kinds, beyond
         self.steps = 0
         self._smallest = min(kind.area for kind in kinds)
 
     def run(self, left: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Floats]]:
-        """Kinds and rough poses (n, 3) of whole arrangements."""
+        """Yield kinds and rough poses (n, 3) of complete arrangements."""
         yield from self._rest(self._cover, left, (), np.zeros((0, 3)))
 
     def _rest(
@@ -166,7 +166,7 @@ class _Search:
         return abs(area - self._kinds[kind].area) < 2.0 * _AREA * self._kinds[kind].perimeter
 
     def _sums(self, area: float, left: tuple[int, ...], most: int) -> bool:
-        """Whether an area may be that of two tokens that are left, or of a few more."""
+        """Whether two to `most` of the tokens that are left may have this area together."""
         areas = {kind.shape: kind.area for kind in self._kinds}
         sizes = [areas[shape] for shape, count in enumerate(left) for _ in range(min(count, most))]
         slack = 3.0 * _AREA * max(kind.perimeter for kind in self._kinds)
@@ -179,12 +179,12 @@ class _Search:
     def corners(
         self, part: Singles, area: float, left: tuple[int, ...], depth: int = 0
     ) -> list[tuple[int, Floats]]:
-        """Tokens at the corners of a part, those first that explain most of its outline."""
+        """Kinds and poses of tokens at corners of a part; the best for its outline come first."""
         self.steps += 1
         names, poses = self._proposed(part, area, left)
         if not len(names):
             return []
-        # What lies beyond the picture may be a token.
+        # Beyond the picture everything counts as covered: a token may continue there.
         part = np.pad(part, self._beyond, constant_values=1.0)
         corner = np.array([self._beyond, -self._beyond, 0.0])
         poses += corner
@@ -207,7 +207,7 @@ class _Search:
         return [(name, pose - corner) for name, pose in kept]
 
     def _proposed(self, part: Singles, area: float, left: tuple[int, ...]) -> tuple[Ints, Floats]:
-        """Kinds (n,) and poses (n, 3) with a corner, and an edge, at a corner of the outline."""
+        """Kinds (n,) and poses (n, 3) that lay a corner and an edge onto those of the outline."""
         names, poses = [], []
         usable = [
             (k, kind)
@@ -238,7 +238,7 @@ class _Search:
         return shares
 
     def _refined(self, part: Singles, names: Ints, poses: Floats) -> tuple[Floats, Floats]:
-        """Poses by the edges that are seen, and how many pixels of the outline they explain."""
+        """Poses refined by visible edges, and how many pixels of the outline each explains."""
         base = np.zeros(len(names), np.int64)
         kinds = [self._kinds[k] for k in names.tolist()]
         every = {reach: Outlines(kinds, reach) for reach in set(_ROUNDS)}
@@ -278,7 +278,7 @@ def _without(left: tuple[int, ...], shape: int) -> tuple[int, ...]:
 
 
 def _inner_points(kind: Kind) -> Complex:
-    """Points spread over a shape, none nearer than a little to its edges."""
+    """Points spread over a shape, at some distance from its edges."""
     corners = kind.corners @ (1.0, 1j)
     rings = [corners * share for share in (0.9, 0.6, 0.3)]
     middles = [(ring + np.roll(ring, -1)) / 2.0 for ring in rings]
@@ -296,7 +296,7 @@ def _levels(cover: Singles, z: Complex) -> Floats:
 
 
 def _convex(part: Singles) -> list[tuple[complex, complex, complex, float]]:
-    """Convex corners of an outline: place, ways to the corners before and after, inner angle."""
+    """Convex corners of an outline: place, vectors to both neighbours, inner angle."""
     mask = (part > 0.5).astype(np.uint8)
     found, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = max(found, key=len)

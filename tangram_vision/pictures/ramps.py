@@ -1,6 +1,6 @@
-"""Poses of several tokens at once, by all pixels that show them.
+"""Fit poses of several tokens at once to all pixels of a picture.
 
-A pixel across an edge is covered in part; where two tokens touch, the parts add up.
+Coverage rises like a ramp across an edge, over one pixel. Where tokens touch, coverages add up.
 """
 
 from collections.abc import Sequence
@@ -12,12 +12,12 @@ from tangram_vision.pictures.kinds import Kind
 
 _ROUNDS = 6
 _STIFF = 1e-3
-_LONGEST = 0.7  # pixels of one step
-_ENOUGH = 0.01  # pixels
+_LONGEST = 0.7  # pixels of one step, at most
+_ENOUGH = 0.01  # pixels: a smaller step is the last one
 
 
 def ramps(kinds: Sequence[Kind], poses: Floats, pixels: int) -> Floats:
-    """Coverage (n, P, P) by each token; poses (n, 3) in pixels."""
+    """Coverage (n, P, P) by each token; poses (n, 3) are in pixels."""
     z = _centres(pixels)
     return np.stack(
         [
@@ -28,16 +28,16 @@ def ramps(kinds: Sequence[Kind], poses: Floats, pixels: int) -> Floats:
 
 
 def fitted(kinds: Sequence[Kind], poses: Floats, cover: Singles) -> tuple[Floats, float]:
-    """Poses (n, 3) by least squares, and what then is unlike.
+    """Poses (n, 3) by least squares, and their remaining difference, see `unlike`.
 
     Args:
-        kinds: n.
-        poses: rough ones.
+        kinds: n kinds.
+        poses: (n, 3) rough poses.
         cover: (P, P) coverage by these tokens.
     """
     seen, z = cover.ravel().astype(np.float64), _centres(len(cover))
     poses = poses.copy()
-    # A step turns by as much as moves a token's edges by a pixel.
+    # Turns are scaled so that a step of 1 moves a token's edges by about a pixel.
     size = np.array([np.sqrt(kind.area) / 2.0 for kind in kinds])
     for _ in range(_ROUNDS):
         rest, change = seen.copy(), np.empty((3 * len(kinds), len(z)))
@@ -60,7 +60,7 @@ def fitted(kinds: Sequence[Kind], poses: Floats, cover: Singles) -> tuple[Floats
 
 
 def unlike(kinds: Sequence[Kind], poses: Floats, cover: Singles) -> float:
-    """The share of the tokens' area in which pixels differ, less where they differ by parts."""
+    """The share of the tokens' area in which pixels differ; small differences count a tenth."""
     rest = np.abs(cover - ramps(kinds, poses, len(cover)).sum(axis=0))
     differs = rest[rest > 0.5].sum() + 0.1 * rest.sum()
     return float(differs / sum(kind.area for kind in kinds))
@@ -72,7 +72,7 @@ def _centres(pixels: int) -> Complex:
 
 
 def _depth(kind: Kind, pose: Floats, z: Complex) -> tuple[Floats, Complex]:
-    """How deep points lie inside, plus a half, and the direction of the nearest edge."""
+    """Depth of points inside a shape, plus 0.5, and the direction of the nearest edge."""
     corners = kind.corners @ (1.0, 1j) * np.exp(1j * pose[2]) + complex(pose[0], pose[1])
     along = np.concatenate([corners[1:], corners[:1]]) - corners
     along /= np.abs(along)

@@ -1,7 +1,7 @@
-"""Coverage by tokens -> where each of a known set lies, on which side, and whether that is sure.
+"""Find the pose and the side of each token in a picture's coverage, and whether they are certain.
 
-Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
-All tokens are known, so what explains one blob leaves less for the others: all are explained
+A blob that looks like one token is fitted at once; other blobs are searched for touching tokens.
+The set of tokens is known, and each token explains one blob only. So all blobs are explained
 together. Tokens that look alike come in any order.
 
 Legend of this package: P pixels along a side of a picture, K tokens, N blobs. Coverage is (P, P)
@@ -25,22 +25,22 @@ from tangram_vision.pictures.edges import refined
 from tangram_vision.pictures.kinds import Kind, kinds_of
 from tangram_vision.pictures.piles import Laid, arrangements, reaching_out
 
-_SMALLEST = 0.4  # of the smallest token: less is dirt
-_CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
-_ROUGH = 0.7  # pixels that the edges of a token may be off, in the mean
-_AREA = 0.35  # pixels along its perimeter by which its area may be wrong
-_DIFFERS = 0.08  # share of a pile that may be explained wrongly
-_ALIKE = 0.01  # so little more explains a pile as well
+_SMALLEST = 0.4  # of the smallest token's area: a smaller blob is dirt
+_CLOSE = 0.15  # kinds so close to the nearest one by moments are compared by their edges
+_ROUGH = 0.7  # pixels of a token's edge error, at most, as root mean square
+_AREA = 0.35  # error of an area over its perimeter, in pixels
+_DIFFERS = 0.08  # share of a pile that may differ from its explanation
+_ALIKE = 0.01  # explanations whose shares differ by less are equally good
 _TRIES = 8  # piles that are searched for one picture
 
 
 @dataclass(frozen=True, eq=False)
 class _Explained:
-    """What one blob is.
+    """An explanation of one blob.
 
     Attributes:
-        laid: its tokens.
-        doubtful: whether they could as well lie otherwise.
+        laid: tokens of the blob.
+        doubtful: whether another arrangement explains the blob as well.
     """
 
     laid: Laid
@@ -48,13 +48,13 @@ class _Explained:
 
 
 def see(cover: Singles, layout: Layout, arena: float) -> Look:
-    """What a picture of an arena shows of a layout's tokens.
+    """Find the tokens of a layout in a picture of the arena.
 
     Args:
-        cover: (P, P) share of each pixel that is covered, by all of them and by nothing else of
-            their size.
+        cover: (P, P) share of each pixel that tokens cover. Nothing else of a token's size may
+            be in the picture.
         layout: the tokens.
-        arena: width of the picture.
+        arena: width of the picture, in units of the layout.
     """
     pixels = len(cover)
     kinds = kinds_of(layout, arena, pixels)
@@ -90,11 +90,11 @@ class _Puzzle:
         return {kind.shape: (kind.area, kind.perimeter) for kind in self.kinds}
 
     def explained(self) -> list[_Explained]:
-        """What the blobs are, as many as can be explained with the tokens that there are."""
+        """Explanations of as many blobs as the available tokens allow."""
         if not len(self.blobs):
             return []
         singles, left = self._singles, self.left
-        # Blobs that look like one token first: they cost nothing.
+        # Blobs that look like one token come first, as they need no search.
         alone = Counter(self.kinds[one.laid.kinds[0]].shape for one in singles.values())
         if len(singles) == len(self.blobs) and alone <= left:
             return [singles[blob] for blob in sorted(singles, reverse=True)]
@@ -123,7 +123,7 @@ class _Puzzle:
         found: list[_Explained],
         whole: bool,
     ) -> Iterator[list[_Explained]]:
-        """Explanations of blobs from some on, all of them where they are to be whole."""
+        """Yield explanations of the blobs in `order`; with `whole`, only those of every blob."""
         if not order:
             yield found
             return
@@ -133,11 +133,11 @@ class _Puzzle:
             if not whole or self._enough(rest, left - used):
                 yield from self._whole(rest, singles, left - used, [*found, one], whole)
         if not whole:
-            # It stays unexplained.
+            # Leave this blob unexplained.
             yield from self._whole(rest, singles, left, found, whole)
 
     def _enough(self, order: Sequence[int], left: Counter[int]) -> bool:
-        """Whether tokens that are left have the areas of blobs."""
+        """Whether the tokens that are left can make up the areas of blobs."""
         if not order:
             return True
         blob, rest = order[0], order[1:]
@@ -150,14 +150,14 @@ class _Puzzle:
         )
 
     def _area_off(self, area: float, shapes: Sequence[int]) -> float:
-        """How far an area is from that of tokens of these shapes, over what it may be."""
+        """Difference between an area and that of these shapes, over the tolerance."""
         own = [self._sizes[shape] for shape in shapes]
         return abs(area - sum(size for size, _ in own)) / (_AREA * sum(round_ for _, round_ in own))
 
     def _options(
         self, blob: int, singles: dict[int, _Explained], left: Counter[int]
     ) -> Iterator[_Explained]:
-        """What a blob may be with the tokens that are left, the simplest first."""
+        """Yield explanations of a blob with the tokens that are left, the simplest first."""
         single = singles.get(blob)
         if single is not None and left[self.kinds[single.laid.kinds[0]].shape]:
             yield single
@@ -165,7 +165,7 @@ class _Puzzle:
             yield from self._piles(blob, left)
 
     def _piles(self, blob: int, left: Counter[int]) -> list[_Explained]:
-        """The pile's best arrangement with each of a few sets of tokens."""
+        """The best arrangement of a pile for each set of tokens that explains it."""
         counts = tuple(left[shape] for shape in range(1 + max(k.shape for k in self.kinds)))
         key = (blob, counts)
         if key in self._known or self._tries >= _TRIES:
@@ -213,7 +213,7 @@ class _Puzzle:
 
 
 def _doubted(best: Sequence[_Explained], every: Sequence[Sequence[_Explained]]) -> list[_Explained]:
-    """The best of every explanation, doubtful where others that are as good have other tokens."""
+    """The best explanations; a blob is doubtful if an equally good one has other tokens there."""
     told = list(best)
     for other in every:
         if _rank(other) > (len(best), _rank(best)[1] - _ALIKE):
@@ -224,7 +224,7 @@ def _doubted(best: Sequence[_Explained], every: Sequence[Sequence[_Explained]]) 
 
 
 def _rank(found: Sequence[_Explained]) -> tuple[int, float]:
-    """More is better, then what differs least."""
+    """A key for sorting: more explained blobs are better, then a smaller difference."""
     return len(found), -max((one.laid.differs for one in found), default=0.0)
 
 

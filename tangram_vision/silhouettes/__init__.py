@@ -1,4 +1,4 @@
-"""An outline, or a picture of one -> where tokens lie that fill it, or come nearest to it.
+"""Fill an outline, or a picture of one, with tokens; or find the nearest figure.
 
 Start with `silhouettes.py` (exact outlines) and `silhouette_pictures.py`. May import
 tangram_vision.pictures.

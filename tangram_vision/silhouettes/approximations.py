@@ -1,10 +1,10 @@
-"""A drawing that tokens cannot fill -> the figure of all of them that comes nearest to it.
+"""Find the figure of all tokens that comes nearest to a drawing that they cannot fill.
 
-Some tokens are taken up, and each is laid anew where it adds most: a correlation tells that of all
-places at once. Then all follow their edges to where these gain. Annealing does so again and again.
+Simulated annealing: a step takes some tokens up and lays each anew where it adds most. A
+correlation gives the gain of all places at once. Then all tokens slide to increase their gain.
 
 Points and directions are complex numbers here. Legend: K tokens, n tokens or places, C corners of a
-token, filled up by repeating the last one, X x Y pixels, M samples on a token's edges.
+token, padded by repeating the last one, X x Y pixels, M samples on a token's edges.
 """
 
 import time
@@ -27,34 +27,34 @@ from tangram_sim.geometry.shapes import mirror_image
 from tangram_vision.silhouettes.silhouettes import covered
 
 _PIXELS = 20  # along the root of all tokens' area
-_MOST = 20_000  # pixels, of a drawing that is long
-_FINE = 8  # parts of a pixel's side that edges tell apart
+_MOST = 20_000  # pixels of the canvas, at most: a long drawing gets larger pixels
+_FINE = 8  # samples of the drawing along a pixel's side
 _TURNS = 8  # angles of a full turn at which tokens are laid
-_STRAIGHT = 0.03  # of the root of all tokens' area: what sides drawn by hand are off straight ones
-_ALIKE = 2.0  # how sharply sides of one direction are told from others
-_RUNS, _STEPS = 3, 500  # of annealing: runs, and steps of each
+_STRAIGHT = 0.03  # of the root of all tokens' area: how far a straight side by hand may stray
+_ALIKE = 2.0  # how sharply directions of sides are told apart
+_RUNS, _STEPS = 3, 500  # annealing runs, and steps of each
 _TAKEN = 4  # tokens that are laid anew at a time, at most
-_HEAT = 0.02  # of the tokens' area: a loss that is taken in 37 of 100 cases, at first
-# Of area that is covered twice, at first and at last, where what is covered once is worth 1: tokens
-# that may lie on others a little come past them.
+_HEAT = 0.02  # of the tokens' area: a loss that is accepted with probability 1/e, at first
+# Cost of area that is covered twice, at first and at last; area covered once is worth 1. At a low
+# cost tokens can move past each other.
 _COSTS = (0.7, 1.5)
-_SHARE = 0.9  # of the time, for annealing; the rest is for the end
-_KEPT = 0.6  # of its speed that a token keeps
-_WIDER = 1.05  # times as far from their middle lie tokens that could not be separated
-_NONE = 1e-9  # length of a corner's edge that is none
+_SHARE = 0.9  # of the time, for annealing; the rest is for the last slides
+_KEPT = 0.6  # share of its speed that a token keeps from step to step
+_WIDER = 1.05  # tokens that cannot be separated are moved so many times as far from their middle
+_NONE = 1e-9  # an edge of this length belongs to a repeated corner
 
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """How tokens follow their edges.
+    """Settings of a slide, in which tokens follow the gain along their edges.
 
     Attributes:
-        steps: of them.
-        samples: on each edge.
-        far: the first step and the last one, in roots of all tokens' area.
+        steps: number of steps.
+        samples: samples on each edge.
+        far: length of the first step and of the last one, in roots of all tokens' area.
         soft: width of edges at first and at last, in pixels.
-        blur: of the drawing, in pixels: across so much more they see what they gain.
-        cost: of area that is covered twice.
+        blur: blur of the drawing, in pixels; edges see a gain from that far.
+        cost: cost of area that is covered twice.
     """
 
     steps: int
@@ -74,14 +74,14 @@ _LAST = (
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Tokens that lie.
+    """Poses of all tokens, and what they cover.
 
     Attributes:
         poses: (K, 3).
         flipped: (K,).
-        masks: (K, X, Y) share of each pixel that each covers.
-        once: share of their area that covers the drawing.
-        twice: share of it that lies on others.
+        masks: (K, X, Y) share of each pixel that each token covers.
+        once: share of the tokens' area that covers the drawing.
+        twice: share of the tokens' area that lies on other tokens.
     """
 
     poses: Floats
@@ -91,25 +91,25 @@ class _State:
     twice: float
 
     def worth(self, cost: float = _COSTS[1]) -> float:
-        """What it covers, less so many times what it covers twice."""
+        """The share that covers the drawing, less `cost` times the share on other tokens."""
         return self.once - cost * self.twice
 
 
 def nearest_figure(
     area: Area, layout: Layout, seconds: float, seed: int = 0, starts: Sequence[Dissection] = ()
 ) -> tuple[Dissection, float]:
-    """All tokens, none on another, as near to a drawing as could be found.
+    """Find the figure of all tokens, without overlap, that comes nearest to a drawing.
 
-    It is the same for a seed, unless the time was too short for all steps: those of seven tans
-    take 2 s, and more beside other work, when it finds a little less. At least one figure is made,
-    in about 0.05 s.
+    The result depends on the seed alone, unless the time is too short for all steps. Seven tans
+    take 2 s, and more on a busy machine; a shorter search finds a little less. At least one figure
+    is made, in about 0.05 s.
 
     Args:
-        area: not empty, in the units of the layout, as large as all tokens.
+        area: the drawing, not empty, in units of the layout, as large as all tokens.
         layout: the tokens.
-        seconds: of this thread's processor time.
-        seed: of what is left to chance.
-        starts: where annealing begins, with some tokens or all, instead of with none.
+        seconds: processor time of this thread.
+        seed: seed of the random steps.
+        starts: arrangements of some tokens or all, where annealing begins instead of with none.
 
     Returns:
         The figure, and its intersection over union with the drawing.
@@ -132,7 +132,7 @@ def nearest_figure(
 
 
 def _apart(found: Dissection, layout: Layout) -> Dissection:
-    """The same tokens, pushed off each other."""
+    """The tokens pushed apart until none lies on another."""
     poses, unit = found.poses.copy(), unit_of(layout)
     while True:
         corners = layout.corners(poses, found.flipped)
@@ -145,7 +145,7 @@ def _apart(found: Dissection, layout: Layout) -> Dissection:
 
 
 def _direction(area: Area, unit: float) -> float:
-    """The angle at which most sides of a drawing lie, or at 45 degrees to it."""
+    """The angle of most sides of a drawing, modulo 45 degrees."""
     every = [np.roll(z, -1) - z for z, _, _ in rings(area, _STRAIGHT * unit)]
     sides = np.concatenate([np.zeros(1, np.complex128), *every])
     angles = np.arange(90) * np.pi / 360.0
@@ -157,13 +157,13 @@ class _Canvas:
     """A drawing in pixels.
 
     Attributes:
-        side: of a pixel.
-        wanted: (X, Y) share of each that is drawn.
-        x, y: (X,) and (Y,) middles of pixels.
+        side: side of a pixel.
+        wanted: (X, Y) share of each pixel that is drawn.
+        x, y: (X,) and (Y,) centres of pixels.
     """
 
     def __init__(self, area: Area, layout: Layout) -> None:
-        """With so much room around it that no token comes around to the other side."""
+        """Draw the area with room around it, as a correlation wraps around at the edges."""
         room = 2.0 * float(layout.radii.max())
         self._low, high = np.array(area.bounds[:2]) - room, np.array(area.bounds[2:]) + room
         size = high - self._low
@@ -196,11 +196,11 @@ class _Canvas:
         return np.asarray(seen[column, row])
 
     def masks(self, normals: Complex, reach: Floats) -> Singles:
-        """Shares (n, X, Y) of pixels in convex polygons.
+        """Shares (n, X, Y) of pixels inside convex polygons.
 
         Args:
-            normals: (n, C) out of each edge, of length 1.
-            reach: (n, C) how far each edge is from the origin along its normal.
+            normals: (n, C) outward normal of each edge, of length 1.
+            reach: (n, C) distance of each edge from the origin along its normal.
         """
         least = np.full((len(normals), len(self.x), len(self.y)), np.inf, np.float32)
         away = (normals / self.side).astype(np.complex64).T[..., None]
@@ -212,31 +212,31 @@ class _Canvas:
 
 
 class _Annealer:
-    """Lays the tokens of a layout in one drawing."""
+    """Simulated annealing of a layout's tokens in one drawing."""
 
     def __init__(self, area: Area, layout: Layout, rng: np.random.Generator) -> None:
         self._layout, self._rng, self._unit = layout, rng, unit_of(layout)
         self._every = np.arange(layout.tokens)
         self._canvas = _Canvas(area, layout)
         body = layout.body[layout.padded_corners]
-        # (2, K, C) on both sides of each.
+        # (2, K, C) corners of each token, with either side up.
         self._bodies: Complex = np.stack([body, list(map(mirror_image, body))]) @ (1.0, 1j)
         self._edges: Complex = np.roll(self._bodies, -1, axis=-1) - self._bodies
         length = np.abs(self._edges)
         self._normals: Complex = -1j * self._edges / np.maximum(length, _NONE)
         reach = (self._normals.conj() * self._bodies).real
         self._reach: Floats = np.where(length > _NONE, reach, np.inf)
-        # What an edge gains counts by its share of a token's edges.
+        # The gain of an edge is weighted by its share of the token's perimeter.
         self._weights: Floats = 4.0 * length / length.sum(axis=-1, keepdims=True)
         base = _direction(area, self._unit)
         self._places = [self._places_of(token, base) for token in self._every.tolist()]
 
     def run(self, start: Dissection, until: float) -> Dissection:
-        """The best of one run of annealing.
+        """The best arrangement of one annealing run.
 
         Args:
-            start: missing tokens are laid first.
-            until: when it ends, see `time.thread_time`.
+            start: poses at first; missing tokens are laid before annealing.
+            until: end of the run, in `time.thread_time`.
         """
         missing = np.setdiff1d(self._every, start.laid)
         state = best = self._next(self._state(start.poses, start.flipped), self._mixed(missing))
@@ -257,19 +257,19 @@ class _Annealer:
         return Dissection(poses, best.flipped)
 
     def _taken(self, state: _State) -> Ints:
-        """Tokens to be laid anew, mostly neighbours."""
+        """Random tokens to lay anew, mostly neighbours."""
         count = int(self._rng.integers(1, min(_TAKEN, len(self._every)) + 1))
         offset = state.poses[:, :2] - state.poses[self._rng.integers(len(self._every)), :2]
         far = np.hypot(*offset.T) * self._rng.uniform(0.5, 1.5, len(offset))
         return np.argsort(far)[:count]
 
     def _mixed(self, tokens: Ints) -> list[int]:
-        """Large tokens first, mostly."""
+        """The tokens in random order, mostly the large ones first."""
         size = self._layout.areas[tokens] * self._rng.uniform(0.4, 1.6, len(tokens))
         return [int(token) for token in tokens[np.argsort(-size)]]
 
     def _next(self, state: _State, order: Sequence[int]) -> _State:
-        """Tokens laid anew, one after the other, each where it adds most."""
+        """The state after tokens are laid anew, one after the other, each where it adds most."""
         poses, flipped, canvas = state.poses.copy(), state.flipped.copy(), self._canvas
         others = [token for token in self._every.tolist() if token not in order]
         lying = state.masks[others].sum(axis=0)
@@ -291,14 +291,14 @@ class _Annealer:
         return _State(poses, flipped, masks, float(once / pixels), float(twice / pixels))
 
     def _masks(self, tokens: Ints, poses: Floats, flipped: Bools) -> Singles:
-        """(n, X, Y) of tokens (n,) in poses (n, 3), on sides (n,)."""
+        """Masks (n, X, Y) of tokens (n,) in poses (n, 3), on sides (n,)."""
         own = flipped.astype(np.int64), tokens
         normals = self._normals[own] * np.exp(1j * poses[:, 2:])
         centre = poses[:, :1] + 1j * poses[:, 1:2]
         return self._canvas.masks(normals, self._reach[own] + (normals.conj() * centre).real)
 
     def _places_of(self, token: int, base: float) -> tuple[Bools, Floats, AnyArray]:
-        """Sides and angles (n,) at which a token is laid, and transforms of its masks there."""
+        """Sides and angles (n,) to try for a token, and Fourier transforms of its masks."""
         layout, canvas = self._layout, self._canvas
         part = 2.0 * np.pi / int(layout.symmetries[token])
         turns = max(1, _TURNS // int(layout.symmetries[token]))
@@ -313,7 +313,7 @@ class _Annealer:
         return sides, angles, scipy.fft.rfft2(centred).conj()
 
     def _slid(self, poses: Floats, flipped: Bools, way: _Way) -> Floats:
-        """Poses to which tokens come that are pushed where their edges gain, and from others."""
+        """Poses after a slide of tokens to where their edges gain, and away from others."""
         own, side = (flipped.astype(np.int64), self._every), self._canvas.side
         share = (np.arange(way.samples) + 0.5) / way.samples
         body = self._bodies[own][..., None] + self._edges[own][..., None] * share
@@ -338,7 +338,7 @@ class _Annealer:
         return np.column_stack([centre.real, centre.imag, angle])
 
     def _lying(self, points: Complex, normals: Complex, reach: Floats) -> Floats:
-        """How many other tokens lie on points (K M,): edges (K, C) are as wide as a unit."""
+        """How many other tokens lie on points (K M,); edges (K, C) are one unit wide."""
         deep = np.full((len(normals), len(points)), np.inf)
         for normal, far in zip(normals.T[..., None], reach.T[..., None], strict=True):
             inside = far - (normal.real * points.real + normal.imag * points.imag)

@@ -1,7 +1,7 @@
-"""A rough outline -> tokens that nearly fill it, by a beam: corners of it may be wrong, or lost.
+"""Nearly fill a rough outline by beam search; corners of the outline may be wrong or missing.
 
-Tokens lie where `tangram_vision.silhouettes.loose` has them, and nothing is searched through: the
-states that are worth most are followed.
+`tangram_vision.silhouettes.loose` proposes places of tokens. The search is not complete: at each
+depth only the best states are followed.
 
 Legend: n states, S different shapes.
 """
@@ -17,17 +17,17 @@ from tangram_sim.geometry.dissections import Budget, Laid, Tokens, less, without
 from tangram_vision.silhouettes.loose import LoosePlaces
 
 WIDTH = 12  # states of each depth that are followed
-_SIZE = 0.25  # value of a token as large as the smallest one, where 1 is its area reaching out
+_SIZE = 0.25  # value of an area that is laid; the same area outside of the outline costs 1
 
 
 class State(NamedTuple):
-    """Tokens that lie, and what they leave.
+    """Tokens that were laid, and the rest of the outline.
 
     Attributes:
-        laid: the tokens.
-        left: how many are left of each shape.
-        rest: what is left to fill.
-        over: area by which the tokens reach out of what there was to fill.
+        laid: the tokens that were laid.
+        left: number of tokens left of each shape.
+        rest: area that is left to fill.
+        over: area of the tokens that lies outside of the area to fill.
     """
 
     laid: tuple[Laid, ...]
@@ -37,26 +37,26 @@ class State(NamedTuple):
 
 
 class Beam:
-    """Lays tokens in one outline after another, following the states of most worth.
+    """Beam search that lays tokens in outlines.
 
-    A state is worth the more, the larger the tokens that lie and the less they reach out.
+    A state ranks higher the larger its laid tokens are, and the less they reach out.
     """
 
     def __init__(self, tokens: Tokens, width: int = WIDTH) -> None:
-        """Follow so many states of each depth."""
+        """Follow the `width` best states of each depth."""
         self._tokens, self._width = tokens, width
         self._least = float(tokens.areas.min())
 
     def run(
         self, outline: Area, left: tuple[int, ...], tolerance: float, budget: Budget
     ) -> list[State]:
-        """How tokens were laid, not always all of them; what covers most by least comes first.
+        """The best states that were found; not all of them lay every token.
 
         Args:
-            outline: in the units of the tokens.
-            left: how many tokens of each shape there are to lay.
-            tolerance: how far its sides may be from where they should be.
-            budget: what it may cost.
+            outline: area to fill, in the units of the tokens.
+            left: number of tokens of each shape to lay.
+            tolerance: distance of the outline's sides from their true places, at most.
+            budget: limit of the search.
         """
         kept = [State((), left, valid(outline), 0.0)]
         places, best = LoosePlaces(self._tokens, tolerance), list[State]()
@@ -84,7 +84,7 @@ class Beam:
         return np.asarray(-(_SIZE * left + over) / self._least)
 
     def _next(self, state: State, places: LoosePlaces, tolerance: float) -> list[State]:
-        """What may follow a state."""
+        """The states with one token more."""
         return [
             State(
                 (*state.laid, place.laid),

@@ -1,8 +1,8 @@
-"""Places of tokens in an outline that may be wrong: they need not fit.
+"""Propose places of tokens in an outline that may be wrong; tokens need not fit exactly.
 
-As in `tangram_sim.geometry.dissections` a token has a corner at a convex one of what is left, with
-an edge along the side that leaves it. But it may reach out of what is left, and no part need have
-the area of tokens.
+The rest is the area that is left to fill. As in `tangram_sim.geometry.dissections`, a token's
+corner is laid onto a convex corner of the rest, with an edge along the side that leaves it. But
+here a token may reach out of the rest, and the areas need not add up.
 """
 
 from typing import NamedTuple
@@ -15,18 +15,18 @@ from tangram_core.arrays import Complex
 from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.dissections import Laid, Tokens, convex_corners, laid_at, parts_of
 
-_OVER = 0.5  # of the smallest token's area that a token may reach out of what is left
-_TURN = np.radians(1.0)  # that a corner's angle may be wrong, and more where its sides are short
-_CORNERS = 40  # of a part that are looked at: tans leave no more
+_OVER = 0.5  # of the smallest token's area: how much of a token may lie outside of the rest
+_TURN = np.radians(1.0)  # error of a corner's angle, at most; more if its sides are short
+_CORNERS = 40  # corners of a part that are tried; tans leave no more
 
 
 class LoosePlace(NamedTuple):
-    """Where a token may lie.
+    """A place where a token may lie.
 
     Attributes:
         laid: the token in its place.
-        polygon: what it covers.
-        over: area by which it reaches out of what is left.
+        polygon: the area that the token covers.
+        over: area of the token outside of the rest.
     """
 
     laid: Laid
@@ -35,13 +35,13 @@ class LoosePlace(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """The same, of which most is thrown away again: a token's corner, by number, and where it is.
+    """A cheap form of `LoosePlace`, since most of them are discarded.
 
     Attributes:
-        corner: number of the corner.
-        at: its place, and the direction of the edge that leaves it.
+        corner: number of the token's corner.
+        at: place of the corner, and direction of the edge that leaves it.
         polygon: see `LoosePlace`.
-        over: see there.
+        over: see `LoosePlace`.
     """
 
     corner: int
@@ -51,10 +51,10 @@ class _Fit(NamedTuple):
 
 
 class LoosePlaces:
-    """Finds them for one set of tokens."""
+    """Finds loose places for one set of tokens."""
 
     def __init__(self, tokens: Tokens, tolerance: float) -> None:
-        """With a tolerance, in their units: how far sides may be from where they should be."""
+        """Set the tokens, and the tolerance of the outline's sides, in units of the tokens."""
         self._tokens, self._tolerance = tokens, tolerance
         self._least = float(tokens.areas.min())
         self._bodies: Complex = np.array([corner.body for corner in tokens.corners])
@@ -63,7 +63,7 @@ class LoosePlaces:
         self._leaving = np.array([corner.leaving for corner in tokens.corners])
 
     def __call__(self, rest: Area, left: tuple[int, ...]) -> list[LoosePlace]:
-        """What may lie at the corner of what is left where least may, but something."""
+        """The places at one corner of the rest: at the one with the fewest, but at least one."""
         least: list[_Fit] = []
         for part in parts_of(rest, self._least):
             for fits in self._of(part, left):
@@ -76,16 +76,16 @@ class LoosePlaces:
         ]
 
     def _of(self, part: Polygon, left: tuple[int, ...]) -> list[list["_Fit"]]:
-        """For each convex corner of a part what may lie there."""
+        """For each convex corner of a part, the tokens that may lie there."""
         found = list(convex_corners(part, self._tolerance))
-        if len(found) > _CORNERS:  # of a rugged outline those with the longest sides
+        if len(found) > _CORNERS:  # a rugged outline: keep corners with long sides
             found = sorted(found, key=lambda one: -min(abs(one[3]), abs(one[4])))[:_CORNERS]
         if not found:
             return []
         point, along, angle, leaving, coming = np.array(found).T[..., None]
         slack = _TURN + 3.0 * self._tolerance / np.minimum(np.abs(leaving), np.abs(coming)).real
         fits = np.array(left)[self._shape] * (self._angle <= angle.real + slack) > 0
-        # A negative length is that of a side that may go on straight inside.
+        # A negative length marks a side that may continue straight into the inside.
         fits &= (leaving.real < 0.0) | (leaving.real >= self._leaving - 2.0 * self._tolerance)
         shapely.prepare(part)
         middle = point + along * self._bodies.mean(axis=1)

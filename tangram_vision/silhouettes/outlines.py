@@ -1,9 +1,8 @@
-"""A picture of a silhouette -> its outline: straight sides, and the corners where they meet.
+"""Trace the outline of a silhouette in a picture as straight sides and corners.
 
-The half level of coverage runs around the silhouette. The chain of its points is cut into straight
-sides by dynamic programming: each side costs as much as some points that lie badly, so that there
-are as many as the points ask for. Sides of tans that touch run at multiples of 45 degrees to each
-other; where nearly all do, they are turned to that.
+The line where coverage is 0.5 runs around the silhouette. Dynamic programming cuts the chain of its
+points into straight sides. A fixed cost for each side keeps their number small. Sides of touching
+tans run at multiples of 45 degrees to each other; sides that nearly do so are turned to that.
 
 Points and directions are complex numbers here, in pixels from the picture's upper left corner, y
 up. Legend: P pixels along a side, n points of a chain.
@@ -23,23 +22,23 @@ from tangram_core.arrays import Complex, Floats, Singles
 from tangram_sim.geometry.areas import Area
 
 _MARGIN = 3  # pixels around a picture
-_SHORT = 10  # points of a chain that is no silhouette's
-_MOST = 4_000  # points of all chains: seven tans of 60 pixels have less than half of it
-_DUST = 6.0  # square pixels of a ring that is none
-_ROUNDED = 1  # points beside a corner that lie within its rounding
+_SHORT = 10  # points: a chain of no more is ignored
+_MOST = 4_000  # points of all chains, at most: seven tans of 60 pixels have less than half of it
+_DUST = 6.0  # square pixels: a smaller ring is ignored
+_ROUNDED = 1  # points beside a corner that are ignored, since blur rounds the corner
 _PARALLEL = np.radians(12.0)
-_ONE_LINE = 0.5  # pixels between two sides that are one
-_GRID = np.radians(6.0)  # that a side's direction may be off the common grid
+_ONE_LINE = 0.5  # pixels between two sides that count as one
+_GRID = np.radians(6.0)  # angle between a side and the common grid, at most
 _SHORT_SIDE, _SHORT_OFF = 8.0, np.radians(16.0)  # the same for sides of few pixels
 
 
 @dataclass(frozen=True)
 class Way:
-    """How the points of a chain are taken for sides.
+    """Settings for cutting a chain of points into sides.
 
     Attributes:
-        spread: pixels that points lie off their side.
-        cost: of one more side, in squares of points' spreads.
+        spread: usual distance of points from their side, in pixels.
+        cost: cost of one more side, in squares of `spread`.
         grid: whether sides are turned to multiples of 45 degrees to each other.
     """
 
@@ -48,7 +47,7 @@ class Way:
     grid: bool
 
 
-# The ways that are tried, the one that is mostly right first.
+# The settings that are tried, the most successful first.
 WAYS = tuple(
     Way(spread, cost, grid)
     for spread, cost in ((0.06, 14.0), (0.06, 8.0), (0.1, 14.0), (0.06, 25.0), (0.15, 20.0))
@@ -62,8 +61,8 @@ class _Side:
 
     Attributes:
         middle: a point on it.
-        along: its direction, the silhouette on one side of it.
-        length: pixels.
+        along: its direction, a complex number of length 1.
+        length: its length in pixels.
         first, last: the points of the chain where it begins and ends.
     """
 
@@ -83,7 +82,7 @@ class _Side:
 
 
 def outline(cover: Singles, way: Way) -> Area:
-    """The outline of the silhouette that coverage (P, P) shows; empty if it is too rugged."""
+    """The outline of the silhouette in coverage (P, P); empty if the outline is too rugged."""
     every = _chains(cover)
     if sum(map(len, every)) > _MOST:
         return Polygon()
@@ -102,8 +101,8 @@ def outline(cover: Singles, way: Way) -> Area:
 
 
 def _chains(cover: Singles) -> list[Complex]:
-    """The closed chains of points (n,) where coverage (P, P) is a half."""
-    # What reaches the picture's edge ends there.
+    """The closed chains of points (n,) where coverage (P, P) is 0.5."""
+    # Padded, so that every chain is closed.
     room = np.pad(cover, _MARGIN)
     lines = contourpy.contour_generator(z=room).lines(0.5)
     corner = complex(_MARGIN - 0.5, 0.5 - _MARGIN)
@@ -112,7 +111,7 @@ def _chains(cover: Singles) -> list[Complex]:
 
 
 def _sides(z: Complex, way: Way) -> list[_Side]:
-    """The sides of a chain, which begins at a corner after the first two attempts."""
+    """The sides of a chain; two attempts find a corner to begin with, the third counts."""
     start = 0
     for attempt in range(3):
         own = np.append(np.roll(z, -start), z[start])
@@ -156,7 +155,7 @@ def _side(z: Complex, first: int, last: int) -> _Side:
 
 
 def _turn_to_grid(sides: Sequence[_Side]) -> None:
-    """Turn sides that are nearly so to multiples of 45 degrees to each other."""
+    """Turn sides to multiples of 45 degrees to each other, if they are near to that."""
     weight = np.array([side.length for side in sides]) ** 2
     eightfold = np.array([side.along for side in sides]) ** 8
     grid = np.angle((weight * eightfold).sum()) / 8.0
@@ -171,7 +170,7 @@ def _turn_to_grid(sides: Sequence[_Side]) -> None:
 
 
 def _corners(ring: Sequence[_Side]) -> Complex:
-    """Where sides meet; sides side by side are joined by a step, and those in line are one."""
+    """Corners where sides meet. A step joins parallel sides; sides in line become one."""
     corners: list[complex] = []
     for i, side in enumerate(ring):
         other = ring[i - 1]

@@ -1,8 +1,8 @@
-"""A picture of a silhouette -> where a layout's tokens lie that explain it.
+"""Fill the silhouette in a picture with a layout's tokens.
 
-The picture is outlined in several ways. Each outline is searched, then a beam lays what need not
-fit; whatever is found is fitted to all pixels, and what then differs judges. Where some of it is
-wrong, the tokens whose pixels differ most are taken up and laid anew in what the others leave.
+The picture is outlined in several ways. Each outline is searched for an exact filling, then a beam
+search lays tokens that need not fit. Each result is fitted to all pixels; the remaining difference
+ranks it. Then tokens whose pixels differ most are taken up, and laid anew in the area left.
 
 Legend: K tokens, P pixels along a side of a picture.
 """
@@ -39,27 +39,27 @@ from tangram_vision.silhouettes.silhouettes import (
     pieces,
 )
 
-_EACH_S = 0.5  # that one outline is searched
-_EACH = 2  # dissections of an outline that are compared, of a search
-_BEST = 3  # and of a beam
-_ALIKE = 0.02  # of a picture that may differ where nothing better is looked for, if it is filled
-_ROUGH = (0.035, 0.07)  # tolerances of a beam
+_EACH_S = 0.5  # for the search of one outline
+_EACH = 2  # dissections compared for each outline and tolerance of a search
+_BEST = 3  # dissections compared for each beam search
+_ALIKE = 0.02  # share of the tokens' area: a smaller difference is good enough, and ends the search
+_ROUGH = (0.035, 0.07)  # tolerances of a beam search
 _AGAIN = 3  # tokens that are laid anew
-_TRIED = 12  # choices of these
+_TRIED = 12  # choices of such tokens that are tried
 _MARGIN = 3  # pixels around a silhouette
 _SHARE = 0.9  # of the time; the rest is for an attempt where nothing was found
 
 
 @dataclass(frozen=True, eq=False)
 class _Explained:
-    """What explains a picture.
+    """An explanation of a picture.
 
     Attributes:
-        found: where the tokens lie, in the units of the layout.
-        kinds: K, of the tokens.
-        poses: (K, 3) in pixels.
+        found: poses of the tokens, in the units of the layout.
+        kinds: K kinds of the tokens.
+        poses: (K, 3) poses in pixels.
         differs: share of the tokens' area in which pixels differ.
-        by: what found it.
+        by: the method, search or beam.
     """
 
     found: Dissection
@@ -73,10 +73,10 @@ def fill_picture(cover: Singles, layout: Layout, view: float, seconds: float) ->
     """The dissection that explains a picture's coverage (P, P) best.
 
     Args:
-        cover: about 0 on the ground and 1 in the silhouette.
+        cover: coverage, about 0 on the ground and 1 in the silhouette.
         layout: the tokens.
         view: width of the picture, in the units of the layout.
-        seconds: for all of it.
+        seconds: processor time, at most.
     """
     begin, unit = time.thread_time(), view / len(cover)
     crop, corner = _cropped(cover)
@@ -94,21 +94,21 @@ def fill_picture(cover: Singles, layout: Layout, view: float, seconds: float) ->
 
 
 def _moved(found: Dissection, way: Floats) -> Dissection:
-    """The same dissection so far (2,) away."""
+    """The dissection moved by `way` (2,)."""
     return replace(found, poses=found.poses + (*way, 0.0))
 
 
 class _Explainer:
-    """Looks for what explains one picture.
+    """Search for the best explanation of one picture.
 
     Attributes:
-        best: what does so far; None at first.
-        attempts: what searches and beams laid where they did not lay all tokens.
-        budget: what was used of it.
+        best: the best explanation so far; None at first.
+        attempts: arrangements that lack tokens.
+        budget: limit of the search, and the steps taken.
     """
 
     def __init__(self, cover: Singles, layout: Layout, kinds: Sequence[Kind], unit: float) -> None:
-        """Of coverage (P, P), pixels of so many units of the layout."""
+        """Explain coverage (P, P); a pixel is `unit` wide, in units of the layout."""
         self._cover, self._layout, self._kinds, self._unit = cover, layout, kinds, unit
         self._tokens = Tokens(layout)
         self._beam = Beam(self._tokens)
@@ -117,7 +117,7 @@ class _Explainer:
         self.budget = Budget(0.0)
 
     def run(self, budget: Budget) -> None:
-        """Until pixels are alike, or the budget is spent."""
+        """Search until an explanation is good enough, or the budget is spent."""
         self.budget = budget
         for way in WAYS:
             area, before = self.outlined(way), self.best
@@ -133,11 +133,11 @@ class _Explainer:
                 return
 
     def outlined(self, way: Way) -> Area:
-        """An outline that the picture may have, in the units of the layout."""
+        """One possible outline of the picture, in the units of the layout."""
         return shapely.transform(outline(self._cover, way), lambda points: points * self._unit)
 
     def _search(self, area: Area) -> bool:
-        """Offer what a search finds; whether pixels are then alike."""
+        """Offer the results of a search; whether the best one is good enough."""
         end = self.budget.until
         self.budget.until = min(time.thread_time() + _EACH_S, end)
         for tolerance in TOLERANCES[1:]:
@@ -156,7 +156,7 @@ class _Explainer:
         left: tuple[int, ...],
         tolerances: Sequence[float],
     ) -> bool:
-        """Offer what a beam lays beside tokens that lie; whether pixels are then alike."""
+        """Offer what a beam lays beside the kept tokens; whether the best one is good enough."""
         for tolerance in tolerances:
             states = self._beam.run(area, left, tolerance * self._tokens.unit, self.budget)
             for state in states[:_BEST]:
@@ -171,7 +171,7 @@ class _Explainer:
         """Lay some tokens anew, those whose pixels differ most first.
 
         Returns:
-            Whether pixels are then alike.
+            Whether the best explanation is good enough.
         """
         wrong, bodies = _wrong(best, self._cover), np.array(pieces(self._layout, best.found))
         count, tolerance = len(wrong), _ROUGH[0] * self._tokens.unit
@@ -191,7 +191,7 @@ class _Explainer:
         return Laid(shape, bool(found.flipped[token]), found.poses[token])
 
     def _offer(self, laid: Sequence[Laid], by: str) -> bool:
-        """Take what explains the picture better; whether pixels are then alike."""
+        """Keep an arrangement if it is the best; whether the best one is good enough."""
         found = dissection(self._tokens, laid)
         kinds = [
             next(kind for kind in self._kinds if k in kind.tokens and kind.flipped == flipped)
@@ -205,7 +205,7 @@ class _Explainer:
 
 
 def _wrong(best: _Explained, cover: Singles) -> Floats:
-    """(K,) how much of the pixels differs that each token covers or touches."""
+    """(K,) sum of the differences of pixels that each token covers or touches."""
     own = ramps(best.kinds, best.poses, len(cover))
     off = np.abs(cover - np.minimum(own.sum(axis=0), 1.0))
     near = np.pad(own, ((0, 0), (1, 1), (1, 1)))

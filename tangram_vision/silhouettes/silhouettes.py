@@ -1,7 +1,7 @@
-"""The outline of a silhouette -> where a layout's tokens lie that fill it.
+"""Fill the outline of a silhouette with a layout's tokens.
 
-It is searched with rising tolerance. Where nothing fills it, a beam tells the tokens that could be
-laid. Legend: K tokens.
+An exact search runs with rising tolerance. If nothing fills the outline, a beam search lays what
+tokens it can. Legend: K tokens.
 """
 
 import time
@@ -20,30 +20,30 @@ from tangram_sim.geometry.overlap import outlines
 from tangram_sim.geometry.rings import covered_area, unit_of
 from tangram_vision.silhouettes.beams import Beam
 
-# Of the root of all tokens' area, the full square's side where they are the tans.
+# Of the root of all tokens' area; for the tans that root is the full square's side.
 TOLERANCES = (0.004, 0.008, 0.014, 0.022, 0.035, 0.05, 0.07, 0.09)
 SOLVED = 0.95  # IoU from which a silhouette counts as filled
-_ROUND = 1e-9  # of the tokens' size, to which corners are rounded
-# Of the root of all tokens' area: what a side of an outline may be off so that no corner of a piece
-# within it is left.
+_ROUND = 1e-9  # of the tokens' size: grid to which corners are rounded
+# Of the root of all tokens' area: a side may bend by so much and still count as straight, so that
+# corners of pieces within it are removed.
 _STRAIGHT, _GRID = 1e-4, 1e-6
 _SHARE = 0.9  # of the time, for the search; the rest is for the best attempt
-_LOOSE = (0.004, 0.022, 0.05)  # tolerances of a beam, for outlines
+_LOOSE = (0.004, 0.022, 0.05)  # tolerances of a beam search, for outlines
 
 
 @dataclass(frozen=True, eq=False)
 class Filled:
-    """How a silhouette was filled.
+    """The result of filling a silhouette.
 
     Attributes:
         found: the dissection that fits best; None if none was found.
-        iou: intersection over union of its tokens and the outline, or the picture's pixels; of the
-            attempt where nothing was found.
-        seconds: that it took.
+        iou: intersection over union of the tokens and the outline, or the picture's pixels; of the
+            attempt, if nothing was found.
+        seconds: processor time that was used.
         nodes: steps of the search.
-        complete: whether all of an outline was searched: no other dissection fills it.
-        attempt: where nothing was found, the tokens that could be laid; None if none could.
-        by: what found it, the search or the beam.
+        complete: whether everything was tried, so that no other dissection fills the outline.
+        attempt: if nothing was found, the tokens that could be laid; None if none could.
+        by: method that found the dissection, search or beam.
     """
 
     found: Dissection | None
@@ -61,23 +61,23 @@ class Filled:
 
 
 def pieces(layout: Layout, found: Dissection) -> list[Polygon]:
-    """The tokens of a dissection that were laid."""
+    """The polygons of the tokens that a dissection lays."""
     corners = layout.corners(found.poses, found.flipped)
     every = outlines(corners[None], layout)[0]
     return [Polygon(every[token]) for token in found.laid.tolist()]
 
 
 def covered(layout: Layout, found: Dissection) -> Area:
-    """What the tokens of a dissection cover."""
+    """The area that the tokens of a dissection cover."""
     size = _ROUND * float(np.sqrt(layout.areas.sum()))
     return shapely.union_all(pieces(layout, found), grid_size=size)
 
 
 def silhouette(layout: Layout, laid: Dissection) -> Area:
-    """What tokens cover, by its outline alone: the same whatever pieces it is made of.
+    """The area that tokens cover; it is the same for every dissection of that area.
 
-    No seam is left and no corner of a piece within a straight side, and where a ring begins does
-    not depend on the pieces.
+    Seams are closed, and corners of pieces within a straight side are removed. The first point of
+    a ring does not depend on the pieces.
     """
     unit = unit_of(layout)
     closed = covered_area(layout.corners(laid.poses, laid.flipped), layout)
@@ -96,14 +96,14 @@ def silhouette(layout: Layout, laid: Dissection) -> Area:
 
 
 def fill_outline(area: Area, layout: Layout, seconds: float) -> Filled:
-    """A dissection of an outline of the tokens' area, or an attempt.
+    """Find a dissection of an outline of the tokens' area, or an attempt.
 
-    The search is complete, so that what a beam lays after it is no more than an attempt.
+    The exact search comes first and is complete. So the result of a beam search is an attempt.
 
     Args:
-        area: in the units of the layout.
-        layout: its tokens.
-        seconds: for all of it.
+        area: the outline, in units of the layout.
+        layout: the tokens.
+        seconds: processor time, at most.
     """
     tokens, begin = Tokens(layout), time.thread_time()
     budget, tried = Budget(begin + _SHARE * seconds), list[list[Laid]]()
@@ -126,7 +126,7 @@ def fill_outline(area: Area, layout: Layout, seconds: float) -> Filled:
 def nearest_fill(
     area: Area, layout: Layout, budget: Budget, tried: Sequence[list[Laid]]
 ) -> tuple[Dissection | None, float]:
-    """What comes nearest to an outline, of what was tried and of beams; and its IoU."""
+    """The nearest dissection to an outline, of those tried and of beam searches; and its IoU."""
     tokens, every = Tokens(layout), [*tried]
     beam = Beam(tokens)
     for tolerance in _LOOSE:
@@ -136,7 +136,7 @@ def nearest_fill(
     if not found:
         return None, 0.0
     shares = [overlap(covered(layout, one), area) for one in found]
-    # Tokens that lie on others cover nothing of their own.
+    # Area of tokens that lies on others counts against a dissection.
     twice = [
         sum(piece.area for piece in pieces(layout, one)) - covered(layout, one).area
         for one in found

@@ -1,9 +1,9 @@
-"""A silhouette that was photographed aslant -> as it is from straight above.
+"""Correct a photograph of a silhouette that was taken at an angle.
 
-Sides of tans that touch run at multiples of 45 degrees to each other. Seen aslant they do not: one
-direction is shortened, and what is farther away is smaller. Where the camera stood is looked for,
-by least squares, so that the sides come back onto one such grid. The picture is then changed to
-what would be seen from above, where that is what the sides ask for, and otherwise not at all.
+Sides of touching tans run at multiples of 45 degrees to each other. In a photograph at an angle
+they do not: one direction is shortened, and distant parts are smaller. Least squares finds the
+camera position that brings the sides back onto one such grid. Then the picture is changed to the
+view from above. If no position fits the sides well, the picture is left as it is.
 
 Points are (..., 2) columns and rows of pixels here. Legend: P pixels along a side of a picture, S
 sides of the silhouette.
@@ -20,24 +20,24 @@ from tangram_vision.silhouettes.outlines import Way, outline
 
 _PIXELS = 256  # along a side of the picture whose sides are looked at
 _WAY = Way(spread=0.15, cost=20.0, grid=False)
-_SHORT = 8.0  # pixels: shorter sides tell no direction
-_STRAY = 0.5  # pixels by which the ends of sides lie off
-_LEAST = 6  # sides, of which four unknowns are told
-# How far the unknowns of `_matrix` usually are from their start.
+_SHORT = 8.0  # pixels: shorter sides give no direction
+_STRAY = 0.5  # pixels: usual error of the ends of sides
+_LEAST = 6  # sides, at least, for four unknowns
+# Start values of the unknowns of `_matrix`, and their usual distances from these.
 _START, _USUAL = np.array([0.0, 0.0, np.log(3.0)]), np.array([0.1, 0.1, 0.3])
-_MOST = 0.2  # change of scale over half of the silhouette: a camera near it that is tilted by 30°
-_OFF = np.radians(0.5)  # the least mean by which sides are off the grid that is corrected
-_REST = 0.25  # share of it that may remain
+_MOST = 0.2  # change of scale over half of the silhouette, at most: a near camera tilted by 30°
+_OFF = np.radians(0.5)  # mean error of sides on the grid: a smaller one is not corrected
+_REST = 0.25  # share of that error that may remain
 _MARGIN = 8  # pixels around the silhouette
 
 
 def from_above(cover: Singles) -> tuple[Singles, Floats]:
-    """Coverage (P, P) as if seen from straight above, of about the same area.
+    """Coverage (P, P) as seen from straight above, of about the same area.
 
     Returns:
-        The coverage (Q, Q), and the homography (3, 3) of its points to those of the picture before;
-        pixels begin at whole numbers. Where nothing is to be corrected, the picture itself, and the
-        homography that changes nothing.
+        The coverage (Q, Q), and the homography (3, 3) from its points to those of the given
+        picture; pixels begin at whole numbers. Without a correction, the picture itself and the
+        identity.
     """
     size = len(cover)
     small = cv2.resize(cover, (min(size, _PIXELS),) * 2, interpolation=cv2.INTER_AREA)
@@ -47,17 +47,17 @@ def from_above(cover: Singles) -> tuple[Singles, Floats]:
         return cover, np.eye(3)
     matrix, side = _placed(correction, sides)
     above = np.asarray(cv2.warpPerspective(cover, matrix, (side, side)), np.float32)
-    # OpenCV has the middle of a pixel at whole numbers.
+    # In OpenCV the centres of pixels are whole numbers.
     return above, shift(0.5, 0.5) @ np.linalg.inv(matrix) @ shift(-0.5, -0.5)
 
 
 def shift(right: float, down: float) -> Floats:
-    """The homography (3, 3) that moves points so far."""
+    """The homography (3, 3) that moves points by `right` and `down`."""
     return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
 
 
 def mapped(matrix: Floats, points: Floats) -> Floats:
-    """Points (..., 2) by a homography (3, 3)."""
+    """Points (..., 2) after a homography (3, 3)."""
     there = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ matrix.T
     found: Floats = there[..., :2] / there[..., 2:]
     return found
@@ -78,7 +78,7 @@ def _sides(cover: Singles) -> Floats:
 
 
 def _correction(sides: Floats) -> Floats | None:
-    """The homography (3, 3) that brings sides onto a grid; None where that is not clear."""
+    """The homography (3, 3) that brings sides onto a grid; None if no good one is found."""
     low, high = sides.min(axis=(0, 1)), sides.max(axis=(0, 1))
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
     own = (sides - middle) / reach
@@ -119,7 +119,7 @@ def _matrix(unknown: Floats) -> Floats:
 
 
 def _grid(sides: Floats, length: Floats) -> float:
-    """The angle of the grid that sides (S, 2, 2) are nearest to."""
+    """The angle of the grid that is nearest to sides (S, 2, 2)."""
     along = (sides[:, 1] - sides[:, 0]) @ np.array([1.0, 1j])
     return float(np.angle((length * (along / np.abs(along)) ** 8).sum()) / 8.0)
 

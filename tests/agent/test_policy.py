@@ -310,20 +310,20 @@ def test_predict_takes_what_the_environments_show() -> None:
     [
         (
             {name: np.zeros(size - 2) for name, size in SHOWN.items()},
-            "observation.'observation'. has shape .51,., and run wants .53,.: give what tangram_t",
+            "observation.'observation'. has shape .51,., but run needs .53,.: use observations of",
         ),
         (
             {name: np.zeros((2, size)) for name, size in SHOWN.items()}
             | {"desired_goal": np.zeros(46)},
-            "observation.'desired_goal'. has shape .46,., and run wants .2, 46.: give what",
+            "observation.'desired_goal'. has shape .46,., but run needs .2, 46.: use",
         ),
         (
             {name: np.zeros((2, 2, size)) for name, size in SHOWN.items()},
-            "has shape .2, 2, 53., and run wants .2, 53.",
+            "has shape .2, 2, 53., but run needs .2, 53.",
         ),
         (
             {name: np.zeros((0, size)) for name, size in SHOWN.items()},
-            "has shape .0, 53., and run wants .1, 53.",
+            "has shape .0, 53., but run needs .1, 53.",
         ),
         (
             {name: np.full(size, np.nan) for name, size in SHOWN.items()},
@@ -334,10 +334,10 @@ def test_predict_takes_what_the_environments_show() -> None:
             "observation.'observation'. must be finite and within .-1e.06: give what",
         ),
         (dict.fromkeys(SHOWN, "corners"), "entries must be numbers: could not convert string"),
-        ({1: 2}, "of observation, achieved_goal, desired_goal, got 1: give what"),
+        ({1: 2}, "of observation, achieved_goal, desired_goal, got 1: give the"),
         ({"observation": np.zeros(53)}, "of observation, achieved_goal, desired_goal, got observ"),
-        ({}, "got an empty one: give what reset or step returns first"),
-        (({}, {}), "got a tuple: give what reset or step returns first"),
+        ({}, "got an empty one: give the observation that reset or step returns"),
+        (({}, {}), "got a tuple: give the observation that reset or step returns"),
     ],
 )
 def test_an_observation_of_another_form_is_refused(observation: Any, reason: str) -> None:

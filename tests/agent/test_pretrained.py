@@ -100,7 +100,7 @@ def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
         (lambda agent: (agent / CONFIG).write_text("a: [1"), "not valid YAML"),
         (lambda agent: (agent / CARD).write_text("[" * 100_000), "cannot be read"),
         (lambda agent: (agent / CARD).write_text('{"format": 1}'), "not of format 2"),
-        (lambda agent: (agent / CARD).write_text('{"format": 2}'), "does not tell the updates"),
+        (lambda agent: (agent / CARD).write_text('{"format": 2}'), "has no number of updates"),
         (lambda agent: with_weights(agent, BFLOAT), "not safetensors: 'BF16'"),
         (lambda agent: with_weights(agent, NAN), "'a' is not finite"),
     ],

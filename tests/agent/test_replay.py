@@ -104,5 +104,5 @@ def test_a_state_with_a_missing_column_or_of_another_layout_is_refused(name: str
     replay.add(numbered(0, 2))
     state = {own: column for own, column in replay.state().items() if own != name}
     other = buffer(4) if name else ReplayBuffer(4, 4, 1, 3)
-    with pytest.raises(RunError, match="it is of another task"):
+    with pytest.raises(RunError, match="it belongs to another task"):
         other.load_state(state)

@@ -66,7 +66,7 @@ def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(
     monkeypatch.setitem(STAGES, "learner", lambda _: [row])
     out = tmp_path / "new" / "learner.json"
     assert run_stages(argparse.Namespace(kind="learner", out=out)) == 0
-    assert "short of the target:\n  learner: a perceptron" in capsys.readouterr().out
+    assert "missed the target:\n  learner: a perceptron" in capsys.readouterr().out
     assert "| learner | a perceptron | updates/s | 1 |" in out.with_suffix(".md").read_text()
     content = json.loads(out.read_text())
     assert {"command", "commit", "processor", "cores", "versions", "rows"} <= content.keys()

@@ -86,7 +86,7 @@ WRONG = [
     ("tangram-train sim.observe=silhouette", "is for an agent of outlines: train one"),
     ("tangram-train +~zzz", "cannot read '+~zzz'"),
     ("tangram-train zzz=1", "unknown setting 'zzz' (--help and --cfg job list them)"),
-    ("tangram-train --seed=1", "unknown option '--seed=1': settings carry no dashes, as in seed=1"),
+    ("tangram-train --seed=1", "unknown option '--seed=1': settings have no dashes, as in seed=1"),
     ("tangram-train seed=1 --cfg jobs", "--cfg takes job, hydra, all, got 'jobs'"),
     ("tangram-train -m seed=1 --cfg job", "--cfg and --multirun do not go together"),
     ("tangram-train seed", "cannot read 'seed': write name=value"),
@@ -120,7 +120,7 @@ WRONG = [
     (
         "tangram-train task=gym task.id=Wears-v0 task.imports=[tests.core.toy] "
         "service.mode=lockstep",
-        "plays an episode otherwise after another one: set task.fresh=true",
+        "depend on earlier ones: set task.fresh=true",
     ),
     ("tangram-master run_dir=/proc/tangram", "run_dir /proc/tangram cannot be made"),
     ("tangram-worker", "say which run: connect=runs/..., or a"),

@@ -266,7 +266,7 @@ def test_a_file_that_changed_before_its_copy_is_refused(tmp_path: Path) -> None:
         (["task=own.py"], "task=own.py: name the class in it, as in task=path/to/file.py:Name"),
         (["from_config=x.yaml", "--cfg", "job"], "--cfg shows presets and arguments alone"),
         (["agent=pipe.py:A"], "it is no file"),
-        (["agent=a.py:A,b.py:B"], "one file at a time: give a sweep for each"),
+        (["agent=a.py:A,b.py:B"], "one file at a time: start a sweep for each"),
     ],
 )
 def test_what_cannot_be_meant_is_told(tmp_path: Path, arguments: list[str], told: str) -> None:

@@ -196,7 +196,7 @@ def test_tans_are_pushed_too(page: Page) -> None:
     expect(page.locator(".finger")).to_be_visible()
     after(page, 6)
     shot(page, "pushed")
-    status(page).to_have_text(re.compile("^(Solved!|It can do no more.)$"))
+    status(page).to_have_text(re.compile("^(Solved!|The agent can do no more.)$"))
 
 
 # Laying out
@@ -208,7 +208,9 @@ def test_a_figure_is_laid_out_of_tans_that_snap_and_lie_beside_each_other(page: 
     (x, y, _), (u, v, _) = (page.evaluate(f"studio.board.poses[{k}]") for k in (0, 1))
     drag(page, [(x, y), (u, v)])
     page.locator("#lay-done").click()
-    status(page).to_contain_text("That did not work: the tans lie in 6 heaps: push them together")
+    status(page).to_contain_text(
+        "That did not work: the tans lie in 6 groups: move them until they touch"
+    )
     expect(page.locator("#status")).to_have_class("bad")
     x, y, _ = page.evaluate("studio.board.poses[0]")
     (a, b), (c, d), _ = page.evaluate("studio.board.tokens[0].corners")
@@ -496,7 +498,7 @@ def test_a_lost_connection_and_a_new_studio_are_told(browser: Browser, tmp_path:
         expect(page.locator("#banner")).to_contain_text("Lost the connection to tangram-studio")
         shot(page, "lost")
     with studio(tmp_path, f"port={first.port}") as second:
-        expect(page.locator("#banner")).to_contain_text("tangram-studio was started anew")
+        expect(page.locator("#banner")).to_contain_text("tangram-studio was restarted")
         opened(page, second)
         expect(page.locator("#banner")).to_be_hidden()
     context.close()
@@ -685,4 +687,4 @@ def test_an_answer_is_saved_as_data(page: Page, tmp_path: Path) -> None:
 def test_tans_that_lie_apart_are_no_figure(page: Page) -> None:
     source(page, "lay")
     page.locator("#lay-done").click()
-    status(page).to_have_text(re.compile("the tans lie in 7 heaps: push them together"))
+    status(page).to_have_text(re.compile("the tans lie in 7 groups: move them until they touch"))

@@ -122,8 +122,8 @@ class Broken(POINT.Point):  # type: ignore[misc,name-defined]
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        ("global randomness", "Points.reset: wanted the same of the same generators"),
-        ("neighbours", "Points.step: wanted an episode as it is beside others"),
+        ("global randomness", "Points.reset: wanted the same episodes from the same"),
+        ("neighbours", "Points.step: wanted an episode alone to equal"),
         ("pays otherwise", "Broken.rewards: wanted what the step was paid"),
         ("flags of numbers", "Points.step: wanted terminated"),
         ("goal moves", "Points.step: wanted field goal to stay"),
@@ -155,7 +155,7 @@ def test_a_task_that_breaks_a_promise_is_told(fault: str, told: str) -> None:
         ),
         ({"rewards": lambda self, a, d: np.zeros((len(a), 1))}, r".rewards: wanted shape \(3,\)"),
         ({"draw": lambda self, played: np.zeros((4, 4))}, ".draw: wanted uint8"),
-        ({"identity": lambda self: {"task": self}}, ".identity: wanted what JSON"),
+        ({"identity": lambda self: {"task": self}}, ".identity: wanted values that JSON"),
     ],
 )
 def test_what_a_task_says_is_checked(changes: Mapping[str, Any], told: str) -> None:
@@ -180,8 +180,8 @@ full = TD3.TD3Learner.broadcast
         ),
         ({"update": lambda self, share, rng: {"q": np.nan}}, ".update: wanted finite"),
         ({"update": lambda self, share, rng: {"q": 1.0}}, ".update: wanted updates to be 1"),
-        ({"load_state": lambda self, state: None}, ".load_state: wanted the numbers of one"),
-        ({"load_networks": lambda self, state: None}, ".load_state: wanted the numbers of one"),
+        ({"load_state": lambda self, state: None}, ".load_state: wanted the numbers of an"),
+        ({"load_networks": lambda self, state: None}, ".load_state: wanted the numbers of an"),
         ({"insert": lambda self, episodes, rng: 0}, ".insert: wanted 1 to"),
     ],
 )

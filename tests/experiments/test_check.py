@@ -94,4 +94,4 @@ def test_what_the_paper_reports_may_stand_everywhere(page: Path) -> None:
 
 def test_scores_without_a_link_are_told(page: Path) -> None:
     page.write_text("# Page\n\nIt has 0.500.\n")
-    assert told(page) == ["page.md: # Page: it has scores and links no file of results"]
+    assert told(page) == ["page.md: # Page: it has scores but links no file of results"]

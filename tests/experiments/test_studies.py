@@ -129,7 +129,7 @@ def test_what_a_training_goes_on_with_is_trained_before_it_though_it_has_its_row
     assert begun == ["one, seed 0", "one, seed 1"]  # one is not whole, so nothing goes on with it
     told = console.export_text()
     for name in ("two", "three", "four"):
-        assert f"{name}, seed 0: not begun, as the training before it failed" in told
+        assert f"{name}, seed 0: not begun, because the training before it failed" in told
 
 
 @pytest.mark.parametrize(

@@ -234,7 +234,7 @@ def test_what_is_deleted_under_a_master_is_told_and_written_anew_at_once(
 GONE: dict[str, tuple[Callable[[Path], object], str]] = {
     "deleted": (shutil.rmtree, "is gone"),
     "moved": (lambda folder: folder.rename(folder.with_name("away")), "is gone"),
-    "another one": (copied, "is another folder now, with a run in it"),
+    "another one": (copied, "was replaced by a folder with another run"),
 }
 
 
@@ -273,7 +273,7 @@ def test_a_second_master_in_a_folder_that_was_made_anew_keeps_it(stage: Stage) -
     made_anew(stage.folder)
     with RunFolder(stage.folder).lock():
         assert not stage.keep(2)
-        assert "cannot be claimed anew (another process works there)" in stage.told[0]
+        assert "cannot be locked again (another process uses it)" in stage.told[0]
         assert {path.name for path in stage.folder.iterdir()} == {".lock", LEASE}
     assert stage.keep(2)
 

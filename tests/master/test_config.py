@@ -24,7 +24,7 @@ pytestmark = pytest.mark.fast
         ({"max_episodes": -1}, "max_episodes must be at least 0, got -1"),
         ({"max_updates": -1}, "max_updates must be at least 0, got -1"),
         ({"resume": "maybe"}, "resume must be one of none, auto, got 'maybe'"),
-        ({"workers": 0}, "workers must be at least 1, got 0: without one nothing is played"),
+        ({"workers": 0}, "workers must be at least 1, got 0: a run needs a player"),
         ({"workers": 1025}, "workers must be between 1 and 1024, got 1025"),
     ],
 )

@@ -215,10 +215,9 @@ def test_everything_ends_with_the_master(
     result, told = finish(launcher(tmp_path, ending, started), tmp_path)
     assert result == status
     tries = [f"({i} of {MAX_RESTARTS})" for i in range(1, MAX_RESTARTS + 1)]
-    expected = [f"the master ended with {said}: it goes on from what it left {t}" for t in tries]
-    expected.append(
-        f"the master ended with {said}; the same command with resume=auto goes on from what it kept"
-    )
+    ended = f"the master ended with {said}"
+    expected = [f"{ended}: it is started again with resume=auto {t}" for t in tries]
+    expected.append(f"{ended}; the same command with resume=auto goes on from what was saved")
     assert told.splitlines() == (expected if said else [])
 
 
@@ -240,7 +239,7 @@ end()"""
     assert status == 0
     waits = [0.01, *[0.02] * (times - 1)]
     assert told.splitlines() == [
-        f"the master ended with status 75: it goes on from what it left (in {wait:g} s)"
+        f"the master ended with status 75: it is started again with resume=auto (in {wait:g} s)"
         for wait in waits
     ]
 
@@ -262,7 +261,8 @@ def test_a_signal_ends_a_master_that_waits_for_its_next_start(
     result, told = finish(made, tmp_path)
     assert result == 128 + signal.SIGINT
     assert told.splitlines()[-1] == (
-        "Ctrl-C (SIGINT): the run ends; the same command with resume=auto goes on from what it kept"
+        "Ctrl-C (SIGINT): the run ends; the same command with resume=auto goes on from what was "
+        "saved"
     )
 
 
@@ -342,7 +342,8 @@ os.kill(os.getpid(), 9)
     status, told = finish(made, tmp_path)
     assert status == 0
     assert told == (
-        f"the master ended with SIGKILL: it goes on from what it left (1 of {MAX_RESTARTS})\n"
+        "the master ended with SIGKILL: it is started again with resume=auto "
+        f"(1 of {MAX_RESTARTS})\n"
     )
     assert len(pids[0]) == 3
     assert pids[0] == pids[1]
@@ -448,7 +449,7 @@ def test_workers_start_only_when_the_master_can_be_reached(tmp_path: Path) -> No
 @pytest.mark.cluster
 @pytest.mark.parametrize(
     ("end", "told"),
-    [("SIGKILL", []), ("SIGSTOP", ["worker 0 has been stopped for 0.3 s: it is killed"])],
+    [("SIGKILL", []), ("SIGSTOP", ["worker 0 was stopped for 0.3 s and was killed"])],
 )
 def test_a_worker_that_dies_or_stays_stopped_is_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, told: list[str]
@@ -490,10 +491,10 @@ if lives < {times}:
     status, told = finish(made, tmp_path)
     assert status == 0
     remedy = {
-        "async": "it goes on with one that is free",
-        "lockstep": "it takes it back in 0.01 s; start others without index=",
+        "async": "it continues with a free index",
+        "lockstep": "it takes the index back in 0.01 s; start other workers without index=",
     }[mode]
-    lost = "worker 0 lost its index to a worker that was started with the same"
+    lost = "worker 0 lost its index to another worker that was started with this index"
     assert told.splitlines() == times * [f"{lost}: {remedy}"]
     last = "index=0" if mode == "lockstep" else "index=-1"
     assert (tmp_path / f"life {times} {last}").exists()
@@ -505,8 +506,8 @@ def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(tmp_path: Path)
     status, told = finish(launcher(tmp_path, players=players), tmp_path)
     assert status == 1
     assert told.count("it is started again") == MAX_RESTARTS
-    assert "worker 0 ended with status 1: given up\nwrong tokens\n" in told
-    assert "worker 1 ended with status 2: given up\nbad input\n" in told
+    assert "worker 0 ended with status 1: it is not started again\nwrong tokens\n" in told
+    assert "worker 1 ended with status 2: it is not started again\nbad input\n" in told
     assert told.endswith("no worker is left: the run ends\n")
 
 
@@ -523,7 +524,7 @@ def test_a_signal_ends_the_master_in_order(
     assert status == 0
     assert (tmp_path / "signal").read_text() == str(int(number))
     name = "Ctrl-C (SIGINT)" if number == signal.SIGINT else number.name
-    assert told == f"{name}: the run ends with a checkpoint, again to end at once\n"
+    assert told == f"{name}: the run ends with a checkpoint; repeat it to end at once\n"
 
 
 @pytest.mark.cluster
@@ -541,7 +542,7 @@ def test_a_master_that_does_not_end_is_killed_by_the_second_signal_or_the_time(
     signalled(made, signal.SIGINT, reachable, monkeypatch)
     status, told = finish(made, tmp_path)
     assert status == 137
-    killed = "the master does not end within 0.2 s: it is killed"
+    killed = "the master did not end within 0.2 s and was killed"
     assert (killed in told) == (signals == "one")
 
 

@@ -345,9 +345,9 @@ def test_who_is_waited_for(
         (
             "SIGINT",
             False,
-            ["Ctrl-C (SIGINT): the run ends with a checkpoint, again to end at once"],
+            ["Ctrl-C (SIGINT): the run ends with a checkpoint; repeat it to end at once"],
         ),
-        ("SIGTERM", False, ["SIGTERM: the run ends with a checkpoint, again to end at once"]),
+        ("SIGTERM", False, ["SIGTERM: the run ends with a checkpoint; repeat it to end at once"]),
         ("SIGINT", True, []),
         (None, False, []),
     ],
@@ -363,7 +363,7 @@ def test_a_signal_is_answered_unless_a_launcher_does(
     made = loop(tmp_path, MADE, FakeHub(MADE, [[scores(MADE, 0)]], ["evaluator"]))
     made.signals.reason = reason
     made.finish(launched)
-    assert [text for text in caplog.messages if "again to end" in text] == said
+    assert [text for text in caplog.messages if "repeat it to end" in text] == said
 
 
 def test_a_second_wish_to_end_is_not_kept_waiting(tmp_path: Path) -> None:

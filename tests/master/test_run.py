@@ -73,7 +73,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(
         assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
         kept = made.checkpointer._journal
         assert (kept.segment, kept.number) == (1, 4)
-    assert "12 episodes come back from the journal" in told()
+    assert "12 episodes restored from the journal" in told()
     assert "goes on after 0 updates" in told()
 
 
@@ -111,7 +111,7 @@ def test_of_the_journal_what_the_whole_checkpoint_does_not_cover_is_read(
         assert made.guard.trainer.episodes == 3 * BATCH
         assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
     back = 8 if corrupt else 4
-    assert told()[-2:] == [f"{back} episodes come back from the journal", "goes on after 0 updates"]
+    assert told()[-2:] == [f"{back} episodes restored from the journal", "goes on after 0 updates"]
 
 
 def test_a_journal_of_another_run_and_a_new_run_in_its_folder_are_refused(tmp_path: Path) -> None:
@@ -160,7 +160,8 @@ def test_the_connection_names_a_host_that_others_reach(
         ports = [int(made.hub.endpoint.rpartition(":")[2])]
         ports.append(int(made.hub.weights_endpoint.rpartition(":")[2]))
     assert connection["endpoint"] == f"tcp://{host}:{ports[0]}"
-    said = f"service.host: no such host{connection['endpoint']} here: workers must know it"
+    why = f"no such host{connection['endpoint']}"
+    said = f"service.host cannot be resolved here ({why}); workers must be able to"
     assert (said in caplog.messages) == ("host" in settings)
     assert connection["weights_endpoint"] == f"tcp://{host}:{ports[1]}"
     http_host = host if settings["bind"] == EVERYWHERE else "127.0.0.1"

@@ -103,11 +103,13 @@ def test_a_goal_that_the_camera_does_not_show_pays_nothing() -> None:
 def test_a_camera_too_coarse_for_a_token_is_refused_with_the_least_that_does() -> None:
     layout, config = layout_of("large_triangle", "square"), RewardConfig(source="camera")
     for sim in (SimConfig(pixels=19), SimConfig(pixels=49, view=2.5)):
-        with pytest.raises(ConfigError, match=r"square covers .* of at least 16: raise") as told:
+        with pytest.raises(
+            ConfigError, match=r"of at least 16 pixels, and square covers .*: raise"
+        ) as told:
             make_reward(config, layout, sim)
         least = int(str(told.value).rpartition(" ")[2])
         make_reward(config, layout, replace(sim, pixels=least))
-        with pytest.raises(ConfigError, match="of at least 16"):
+        with pytest.raises(ConfigError, match="of at least 16 pixels"):
             make_reward(config, layout, replace(sim, pixels=least - 1))
 
 

@@ -30,7 +30,7 @@ def test_what_was_laid_is_filled() -> None:
     ("shifts", "why"),
     [
         ([(0, 0.15)], "the tans lie on each other: move them apart"),
-        ([(k, 3.0 * (k + 1)) for k in range(3)], "lie in [4-6] heaps: push them together"),
+        ([(k, 3.0 * (k + 1)) for k in range(3)], "lie in [4-6] groups: move them until they touch"),
     ],
 )
 def test_what_is_no_figure_is_refused(shifts: list[tuple[int, float]], why: str) -> None:

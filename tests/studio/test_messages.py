@@ -61,5 +61,5 @@ def test_what_a_page_asks_for_is_read(message: dict[str, object], kind: type) ->
     ],
 )
 def test_what_no_page_asks_for_is_refused_in_one_line(text: str) -> None:
-    with pytest.raises(ConfigError, match="the page's message is not understood .*: load it anew"):
+    with pytest.raises(ConfigError, match="cannot read the page's message .*: reload the page"):
         read(text)

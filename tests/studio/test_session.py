@@ -102,8 +102,8 @@ def test_it_goes_on_from_where_a_token_was_taken() -> None:
 @pytest.mark.parametrize(
     ("message", "why"),
     [
-        ("{", "the page's message is not understood"),
-        ('{"ask": "fill", "number": 1}', "a puzzle, a drawing or pieces are to be filled"),
+        ("{", "cannot read the page's message"),
+        ('{"ask": "fill", "number": 1}', "exactly one of puzzle, outlines and pieces"),
         ('{"ask": "fill", "number": 1, "puzzle": "unicorn"}', "unknown puzzle 'unicorn'"),
         ('{"ask": "fill", "number": 1, "puzzle": "/etc/passwd"}', "unknown puzzle"),  # no file
     ],

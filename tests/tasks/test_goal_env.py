@@ -105,7 +105,9 @@ def test_an_episode_is_cut_by_itself_whatever_its_settings(made: list[Any]) -> N
         made[-1].action_space.seed(0)
         ends = [any(made[-1].step(made[-1].action_space.sample())[2:4]) for _ in range(horizon)]
         assert ends == [False] * (horizon - 1) + [True]
-        with pytest.raises(RuntimeError, match=f"no episode of {horizon} steps goes on: call res"):
+        with pytest.raises(
+            RuntimeError, match=f"episode of {horizon} steps is over or was not begun"
+        ):
             made[-1].unwrapped.step(made[-1].action_space.sample())
 
 

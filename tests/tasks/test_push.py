@@ -207,7 +207,7 @@ def test_one_of_two_tokens_is_half_of_the_reward() -> None:
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.0,)])
 def test_weights_of_no_tokens_are_refused_where_it_learns(weights: tuple[float, ...]) -> None:
     with pytest.raises(
-        ConfigError, match="task.fewer=.* must have at most 1 weights, of 1, 2, ... tokens, and one"
+        ConfigError, match="task.fewer=.* must have at most 1 weights, for 1, 2, ... tokens, with"
     ):
         replace(SQUARE, config=PushConfig(fewer=weights)).check(plays=False)
 
@@ -223,7 +223,7 @@ def test_it_learns_from_fewer_tokens_too_and_is_tested_with_all() -> None:
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"count": 2}, "task.count=2, and there are 1 tokens: set it to at most 1, or choose"),
+        ({"count": 2}, "task.count=2, and the set has 1 tokens: set it to at most 1, or choose"),
         (
             {"spread": (2.0, 1.0)},
             "task.spread must be a range, the lower end first, got .2,1.: write it as .1,2.",

@@ -100,7 +100,7 @@ def test_the_arm_pushes_as_the_finger_does(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(Panda, "push", lambda *_: None)
         step = held.step(actions)
         np.testing.assert_array_equal(step.seen["corners"], ends[1])
-        assert held.refused[0] == "the arm does not get there"  # type: ignore[attr-defined]
+        assert held.refused[0] == "the arm cannot reach there"  # type: ignore[attr-defined]
 
 
 def test_a_film_has_the_way_of_every_push_and_ends_where_it_was_recorded() -> None:
@@ -233,9 +233,7 @@ def test_without_a_figure_a_task_without_a_plan_writes_none(tmp_path: Path) -> N
     told = ("run_dir=pretrained/square", f"out={tmp_path / 'x.json'}")
     status, _, err = here("tangram-play", *told, cwd=tmp_path)
     assert (status, list(tmp_path.iterdir())) == (2, [])
-    assert (
-        "x.json is for where tokens lie in a figure, or a finger's way: name the figure by" in err
-    )
+    assert "x.json is for positions of tokens in a figure, or a plan of pushes: name" in err
 
 
 def test_an_arm_that_never_pushed_is_filmed_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ EDITS: dict[str, tuple[dict[str, Any], str, Any]] = {
     "shape must be one of large_triangle, ": (PUZZLES, "puzzles/0/pieces/0/shape", "ear"),
     "corners must be a list of 3 pairs, got 0": (PUZZLES, "puzzles/0/pieces/0/corners", []),
     "a corner must be .x, y., finite": (PUZZLES, "puzzles/0/pieces/0/corners/0", [0, "1"]),
-    "keys format, version, outlines, and perhaps side": (OUTLINE, "title", "mine"),
+    "keys format, version, outlines, and optionally side": (OUTLINE, "title", "mine"),
     "side must be .* leave it out where it is not known": (OUTLINE, "side", 0),
     "outline 1 must be a list of 3 to 2000 corners": (OUTLINE, "outlines/0", [[0, 0]]),
 }
@@ -112,7 +112,7 @@ CASES: dict[str, tuple[Given, ...]] = {
         file(edited(TWO, "puzzles/1/name", "my_cat"), how=play_by_run),
         file(TWO, how=play_by_run),
     ),
-    "has 2 puzzles.*: take a file of one": (file(TWO), file(PUZZLES)),
+    "has 2 puzzles.*: use a file with one puzzle": (file(TWO), file(PUZZLES)),
     "outlines must be a list of 1 to 100, got 101": (
         file(outlines(*strips(101))),
         file(outlines(*strips(100))),
@@ -139,7 +139,7 @@ CASES: dict[str, tuple[Given, ...]] = {
         svg(SVG.replace("0 0 300 300", "0 0 200 200")),
         svg(SVG),
     ),
-    "cannot be drawn .*: take away its filters and groups within groups, or give a PNG": (
+    "cannot be drawn .*: remove its filters and nested groups, or give a PNG": (
         svg(DEEP),
         svg(re.sub("</?g>", "", DEEP)),
         PNG,
@@ -191,7 +191,7 @@ CASES: dict[str, tuple[Given, ...]] = {
         png(TIGHT),
         png(ImageOps.expand(TIGHT, 60, 235)),
     ),
-    "a part of it reaches the picture's edge, leave ground around it": (
+    "cut off by the picture's edge: leave ground around the silhouette": (
         png(EDGE),
         png(ImageOps.expand(EDGE, 60, 235)),
     ),
@@ -204,7 +204,7 @@ CASES: dict[str, tuple[Given, ...]] = {
         png(photograph()),
         png(photograph(count=6), how=take_for_one_figure),
     ),
-    "tokens too small: .*: take it from nearer, or larger; or set silhouette=": (
+    "tokens too small: .*: take it from nearer, or with more pixels; or set silhouette=": (
         png(photograph(unit=30.0)),
         png(photograph()),
         png(photograph(unit=30.0), how=take_for_one_figure),

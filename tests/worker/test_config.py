@@ -27,7 +27,7 @@ OF_A_RUN = [
 ]
 WRONG = {
     WorkerConfig: [
-        ({"connect": " "}, "set connect=HOST:PORT"),
+        ({"connect": " "}, "set connect=RUN_DIR"),
         ({"role": "dancer"}, "role must be one of player, evaluator, got 'dancer'"),
         ({"index": -2}, "index must be between -1 and 65535, got -2"),
         ({"index": 65536}, "index must be between -1 and 65535, got 65536"),
@@ -124,7 +124,7 @@ def test_puzzles_are_for_the_agent_of_the_game_if_there_is_one(
 ) -> None:
     monkeypatch.setattr("tangram_game.config.agent_names", lambda: ["square", "tangram7"])
     assert EvalConfig(puzzle=("test",)).run == "pretrained/tangram7"
-    with pytest.raises(ConfigError, match="^out=.* would be written over puzzle=.*: name another"):
+    with pytest.raises(ConfigError, match="^out=.* would overwrite puzzle=.*: name another"):
         EvalConfig(puzzle=(__file__,), out=__file__)
     assert EvalConfig("runs/one", puzzle=("test",)).run == "runs/one"
     with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):

@@ -109,7 +109,7 @@ def test_the_line_that_starts_an_evaluator_works_as_it_is(tmp_path: Path) -> Non
     assert _evaluator("h:1") == "tangram-worker connect=h:1 role=evaluator"
     pair, server = asdict(make_pair()), make_pair().public
     path.write_text(json.dumps(content | {"server_key": server, "keys": {"player": pair}}))
-    said = f"{path} has no key for one, tangram-keys makes it (add=NAME role=evaluator)"
+    said = f"{path} has no key for one; make it with tangram-keys (add=NAME role=evaluator)"
     assert _evaluator(str(path)) == said
 
 

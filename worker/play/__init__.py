@@ -1,4 +1,4 @@
-"""Playing whole episodes, and the session that player and evaluator share.
+"""Players: whole episodes, and the session code that players and evaluators share.
 
 Start with `player.py` and `rollout.py`. May import worker.talk.
 """

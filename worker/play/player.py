@@ -1,4 +1,4 @@
-"""The process that plays: explores with the newest weights, sends whole episodes."""
+"""The player: explores with the newest weights and sends whole episodes to the master."""
 
 import math
 from contextlib import closing
@@ -15,16 +15,16 @@ from worker.talk.client import Client
 
 
 def run_player(config: WorkerConfig, setup: Setup) -> int:
-    """Play until the master or a signal ends it.
+    """Play until the master or a signal stops this process.
 
     Returns:
         Exit status 0.
 
     Raises:
-        TangramError: a setting that cannot work, or a master that refuses or is gone for long.
+        TangramError: a setting cannot work, or the master refuses or does not answer for long.
     """
     acting = Acting(setup.agent.actor(setup.task))
-    # What is too large for a message is split.
+    # Groups of episodes that are too large for one message are split.
     service, horizon = config.service, setup.spec.horizon
     size = min(service.batch_episodes(horizon), most_episodes(setup.spec))
     with (
@@ -41,13 +41,13 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
         acting.follow(first)
         me = client.welcome
         if me.lockstep:
-            # Nothing may depend on how often a process was started.
+            # Lockstep is reproducible: the incarnation (number of restarts) must have no effect.
             alike = Rollout(env, setup.spec, me.seed, config.role, me.index, 0)
             _play_in_step(client, acting, alike, report)
             return 0
         rollout = Rollout(env, setup.spec, me.seed, config.role, me.index, me.incarnation)
         while _wait_for_room(client, report):
-            # Weights change here and nowhere else: a batch is played with one version.
+            # Weights change only here, so every batch is played with one version.
             newest = client.newest_weights()
             if newest is not None:
                 acting.follow(newest)
@@ -60,12 +60,12 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
 
 
 def _play_in_step(client: Client, acting: Acting, rollout: Rollout, report: Report) -> None:
-    """Play what is ordered, with the weights that are ordered, until the client is stopped."""
+    """Play the episodes and weights version of each order until the client is stopped."""
     done: Go | None = None
     while (order := client.wait_for_order(done)) is not None:
         if order.episodes % rollout.envs:
             raise TangramError(
-                f"the master's lockstep asks for {order.episodes} episodes, no multiple of "
+                f"the lockstep master asks for {order.episodes} episodes, not a multiple of "
                 f"service.envs={rollout.envs}: start this worker with the master's service settings"
             )
         while acting.version != order.version:
@@ -83,16 +83,16 @@ def _play_in_step(client: Client, acting: Acting, rollout: Rollout, report: Repo
 
 
 def _wait_for_room(client: Client, report: Report) -> bool:
-    """Wait until one more batch may be on its way; False if the client was stopped."""
+    """Wait until the window has room for a batch; False if the client was stopped."""
     client.poll()
     if client.window_free > 0:
         return not client.stopped
-    with report.waiting("the master is behind, nothing more is played before it has caught up"):
+    with report.waiting("the master is behind, this player goes on when the master has caught up"):
         return client.wait_for_window()
 
 
 def _play(rollout: Rollout, acting: Acting, client: Client, groups: int) -> Episodes:
-    """So many groups of episodes, fewer if the client is stopped."""
+    """Play `groups` groups of episodes, fewer if the client is stopped."""
 
     def go_on() -> bool:
         client.poll()

@@ -1,4 +1,4 @@
-"""Playing whole episodes, as many at a time as there are environments.
+"""Rollouts of whole episodes, one episode per environment at a time.
 
 Legend: E episodes, B environments, T steps of an episode.
 """
@@ -14,22 +14,22 @@ from tangram_core.seeding import episode_generator
 from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
 from tangram_core.task import Chooser, Env, Generators, History, Played
 
-# Numbers of episodes (B,), a generator for each -> what is observed as they begin.
+# Numbers of episodes (B,), a random generator for each -> their first observations.
 Begin = Callable[[Ints, Generators], Arrays]
 
 
 def greedy(actor: Actor) -> Chooser:
-    """The actor as well as it can."""
+    """The actor's policy without exploration."""
     return lambda seen, past, _: actor.act(seen, past)
 
 
 def exploring(actor: Actor) -> Chooser:
-    """The actor as it explores."""
+    """The actor's policy with exploration."""
     return actor.act
 
 
 def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
-    """The same episodes, at most `size` at a time, nothing copied."""
+    """Split episodes into parts of at most `size`, as views without copies."""
     for first in range(0, episodes.count, size):
         yield episodes.at(slice(first, first + size))
 
@@ -45,19 +45,19 @@ def play(
     facts: bool = False,
     go_on: Callable[[], bool] = lambda: True,
 ) -> Played:
-    """So many episodes, as many at a time as there are environments.
+    """Play `count` episodes, one per environment at a time.
 
     Args:
-        env: where.
-        spec: of the task.
-        choose: gives the actions.
-        generator: of the episode with this number, from 0: it makes the episode, then whatever
-            `choose` draws, so an episode does not depend on those played beside it.
-        count: of episodes; the environments that have none left at the end play the first again.
-        begin: in place of the environment's own reset.
-        facts: whether what only the environments know is kept, too.
-        go_on: asked before each action; if not, the episodes that are being played are left out
-            of what is returned.
+        env: the vector of environments.
+        spec: shapes of the task's episodes.
+        choose: the policy.
+        generator: number of an episode, from 0 -> its random generator. The generator sets up the
+            episode and then serves `choose`, so episodes played together are independent.
+        count: number of episodes. In the last group, spare environments repeat the first episodes.
+        begin: replaces the reset of the environment.
+        facts: whether to record `env.facts()` at every moment.
+        go_on: called before each action; if it returns False, play ends and unfinished episodes
+            are left out.
     """
     whole = -(-count // env.count) * env.count
     room = _Room(spec, whole, facts)
@@ -71,7 +71,7 @@ def play(
 
 
 class _Room:
-    """Room for whole episodes, and the rows of it that are being filled."""
+    """Arrays of whole episodes, and the rows that are being filled."""
 
     def __init__(self, spec: EpisodeSpec, count: int, facts: bool) -> None:
         self.spec, self.episodes = spec, spec.empty(count)
@@ -80,12 +80,12 @@ class _Room:
         self.rows = slice(0, 0)
 
     def at(self, first: int, count: int) -> "_Room":
-        """The same, to be filled from there on."""
+        """This object, with `count` rows from `first` on selected for filling."""
         self.rows = slice(first, first + count)
         return self
 
     def look(self, seen: Arrays, env: Env, t: int) -> None:
-        """Keep what is observed at a moment, and what the environments know."""
+        """Record the observations, and the facts of the environments, at a moment."""
         for field in self.spec.fields:
             if field.per == "moment":
                 self.episodes[field.name][self.rows, t] = seen[field.name]
@@ -102,13 +102,13 @@ class _Room:
             self.facts[name][self.rows, t] = value
 
     def history(self, t: int) -> History:
-        """What was until this moment."""
+        """Observations and actions of the selected rows up to moment t."""
         moments = [field.name for field in self.spec.fields if field.per == "moment"]
         seen = {name: self.episodes[name][self.rows, : t + 1] for name in moments}
         return History(seen, self.episodes.actions[self.rows, :t])
 
     def played(self, count: int) -> Played:
-        """The first episodes."""
+        """The first `count` episodes, as a result."""
         facts = {name: one[:count] for name, one in (self.facts or {}).items()}
         first = slice(count)
         return Played(self.episodes.at(first), facts, self.seconds[first], self.chose[first])
@@ -122,7 +122,7 @@ def _play_group(
     room: _Room,
     go_on: Callable[[], bool],
 ) -> bool:
-    """The episode in every environment; False if told to end."""
+    """Play one episode in every environment; False if `go_on` ended the play."""
     rows, episodes = room.rows, room.episodes
     began = time.perf_counter()
     for t in range(room.spec.horizon):
@@ -143,10 +143,10 @@ def _play_group(
 
 
 class Rollout:
-    """Endless play for learning: every episode once, each with a generator of its own.
+    """Endless play for learning; every episode has its own random generator.
 
     Attributes:
-        episode: number of the next episode in this incarnation.
+        episode: number of the next episode in this incarnation of the worker.
     """
 
     def __init__(
@@ -164,13 +164,13 @@ class Rollout:
 
     @property
     def envs(self) -> int:
-        """Episodes that are played at a time."""
+        """Number of environments, that is of episodes played at a time."""
         return self._env.count
 
     def play(
         self, choose: Chooser, groups: int = 1, go_on: Callable[[], bool] = lambda: True
     ) -> Episodes:
-        """The next episodes, `groups` times one in every environment; see `play`."""
+        """Play the next `groups` episodes in every environment; see the function `play`."""
         first, count = self.episode, groups * self._env.count
         played = play(
             self._env,

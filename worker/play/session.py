@@ -1,4 +1,4 @@
-"""What player and evaluator share: joining a master, ending on a signal, and log lines."""
+"""Code that player and evaluator share: join a master, end on a signal, write log lines."""
 
 import logging
 import signal
@@ -33,34 +33,34 @@ _log = logging.getLogger(__name__)
 
 
 class Acting:
-    """An actor with the version of its weights, -1 before the first."""
+    """An actor and the version of its weights, -1 before any were loaded."""
 
     def __init__(self, actor: Actor) -> None:
         self.actor, self.version = actor, -1
 
     def follow(self, weights: Weights) -> None:
-        """Take over weights that were broadcast; RunError if they are of another network."""
+        """Load broadcast weights; RunError if they belong to another network."""
         self.actor.load(weights.tensors)
         self.version = weights.version
 
 
 class IndexTakenError(TangramError):
-    """The index that the master gave to this process, which asked for any, is another's now."""
+    """The index that the master chose for this process was taken by another process."""
 
 
 @contextmanager
 def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]:
-    """A client to the master that has joined, or that was stopped while it tried.
+    """A client that has joined the master, or that was stopped before it could.
 
-    On leaving, the master is told, after the batches that are on their way, and the signal handlers
-    are put back.
+    On exit the client says goodbye to the master, after all queued batches, and the former signal
+    handlers are restored.
 
     Raises:
-        TangramError: the master refuses, or does not answer.
-        IndexTakenError: another process asked for the index that this one was given.
+        TangramError: the master refuses or does not answer.
+        IndexTakenError: another process took the index that the master chose for this one.
     """
     watch_parent()
-    # Several workers share one machine: more threads each would only get in each other's way.
+    # Several workers share one machine, so more threads in each would only slow all of them.
     torch.set_num_threads(1)
     keep_memory()
     service = config.service
@@ -77,7 +77,7 @@ def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]
         actor.shapes,
     )
     client.on_progress = watchdog.progress
-    # They stop the client instead of the process, so that it can say BYE.
+    # Signals stop the client, not the process, so that the client can say BYE.
     with client, handling(lambda number: client.stop(number.name), SIGNALS), watchdog:
         if client.join():
             me = client.welcome
@@ -91,20 +91,20 @@ def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]
 
 
 def keep_part(run: Callable[[WorkerConfig, Setup], int], config: WorkerConfig, setup: Setup) -> int:
-    """Run a player or an evaluator, and again when another process takes the index it was given.
+    """Run a player or an evaluator, and run it again whenever another process takes its index.
 
-    Returns its exit status, and raises what it does.
+    Returns the exit status of `run`; errors of `run` other than IndexTakenError pass through.
     """
     while True:
         try:
             return run(config, setup)
         except IndexTakenError as error:
             fields = {"event": "index_taken"}
-            _log.info("%s: it goes on with an index that is free", error, extra=fields)
+            _log.info("%s: this process joins again, with a free index", error, extra=fields)
 
 
 def log_as(who: str, log_format: str) -> None:
-    """Write the log lines of this process to stderr, with the time and who writes them."""
+    """Send the log lines of this process to stderr, each with the time and the name `who`."""
     logger = logging.getLogger("worker")
     logger.setLevel(logging.INFO)
     for former in [h for h in logger.handlers if isinstance(h, _Lines)]:
@@ -115,11 +115,11 @@ def log_as(who: str, log_format: str) -> None:
 
 
 class _Lines(logging.StreamHandler[TextIO]):
-    """The handler that `log_as` replaces."""
+    """The log handler of `log_as`, a class of its own so that a second call can replace it."""
 
 
 class Report:
-    """What a player tells its log: that it waits, and every now and then how fast it plays."""
+    """Log lines of a player: reasons for waiting, and its speed every REPORT_S seconds."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class Report:
 
     @contextmanager
     def waiting(self, why: str) -> Iterator[None]:
-        """Count the time inside as waiting; each reason is logged once between two reports."""
+        """Count the time in this context as waiting; log each reason once between two reports."""
         if why not in self._told:
             _log.info("waits: %s", why, extra={"event": "waits"})
             self._told.add(why)
@@ -149,10 +149,10 @@ class Report:
             self._waited += self._clock() - start
 
     def played(self, episodes: int, version: int) -> dict[str, float]:
-        """Count episodes; a line when it is time.
+        """Count episodes played with weights of `version`, and log the speed when it is due.
 
         Returns:
-            Episodes since the start, and the seconds of a processor that they took.
+            "episodes" and "busy_s": episodes and CPU seconds since the start.
         """
         self._episodes += episodes
         self._total += episodes

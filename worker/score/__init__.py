@@ -1,4 +1,4 @@
-"""Scoring the newest weights on fixed tests: the tests, what they are worth, the loop.
+"""Evaluators: score the newest weights on a fixed set of test episodes.
 
 Start with `evaluator.py`. May import worker.play and worker.talk.
 """

@@ -1,4 +1,4 @@
-"""The process that scores: plays the fixed test set with the newest weights, noise off."""
+"""The evaluator: plays the fixed test set with the newest weights, without exploration."""
 
 import logging
 import time
@@ -19,19 +19,19 @@ from worker.score.test_set import FixedTests
 from worker.talk.client import Client
 
 POLL_S = 0.2
-# Weights that no newer ones follow for so long are probably the last: their score is waited for.
+# Weights are scored at once if no newer ones follow for so long: they are probably the last.
 STILL_S = 2.0
 
 _log = logging.getLogger(__name__)
 
 
 class Schedule:
-    """Which weights are scored, and when: at most one evaluation each `interval` seconds.
+    """Decides which weights are scored and when: normally once every `interval` seconds.
 
-    A version that nothing newer follows is scored without waiting for the interval's end, and
-    whatever happens the newest version is scored in the end. It stands still when nothing follows
-    for `still` seconds, and for as long as scoring takes: an agent that learns in bursts, since it
-    waits for pictures, would else be scored all the time, on a core that its players need.
+    If no newer weights arrive for `still` seconds, the newest are scored at once. So the last
+    weights of a training are always scored. The wait is never shorter than the last evaluation:
+    otherwise an agent that learns in bursts would be scored all the time, and the evaluator would
+    take a core that the players need.
     """
 
     def __init__(self, interval: float, still: float) -> None:
@@ -40,12 +40,12 @@ class Schedule:
         self._arrived = self._began = -np.inf
 
     def offer(self, weights: Weights | None, now: float) -> None:
-        """Note newer weights; None if none arrived."""
+        """Store newer weights, the next candidate; None if none arrived."""
         if weights is not None:
             self._newest, self._arrived = weights, now
 
     def due(self, now: float) -> Weights | None:
-        """The weights to score now; each is given once."""
+        """The weights to score now, or None; every version is returned at most once."""
         waited, stood = now - self._began, now - self._arrived
         if self._newest is None or (waited < self._interval and stood < self._still):
             return None
@@ -53,12 +53,15 @@ class Schedule:
         return weights
 
     def scored(self, now: float) -> None:
-        """Note that what was due is scored."""
+        """Record that the weights from `due` have been scored."""
         self._still = max(self._least_still, now - self._began)
 
 
 def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
-    """Score the newest weights until the master or a signal ends it; as `run_player`."""
+    """Score the newest weights until the master or a signal stops this process.
+
+    Exit status and errors are those of `run_player`.
+    """
     acting, service = Acting(setup.agent.actor(setup.task)), config.service
     schedule = Schedule(service.eval_seconds, max(STILL_S, 4.0 * service.publish_seconds))
     at_once = service.envs_for(setup.spec.horizon)
@@ -78,7 +81,7 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
 
 
 def _evaluate(tests: FixedTests, acting: Acting, client: Client) -> Scores | None:
-    """Scores of what is loaded; None if the client was stopped meanwhile."""
+    """Scores of the loaded weights; None if the client was stopped during the test."""
     began, task = time.monotonic(), tests.task
 
     def go_on() -> bool:
@@ -104,7 +107,7 @@ def _evaluate(tests: FixedTests, acting: Acting, client: Client) -> Scores | Non
 
 
 def framed(picture: Pixels) -> Pixels:
-    """A picture (H, W, 3) as a message takes it: smaller if need be, its paper as wide."""
+    """A picture (H, W, 3) fitted to a message: shrunk if too large, padded to the full width."""
     image = Image.fromarray(picture)
     image.thumbnail((PICTURE_WIDTH, PICTURE_HEIGHT))
     canvas = Image.new("RGB", (PICTURE_WIDTH, image.height), image.getpixel((0, 0)))

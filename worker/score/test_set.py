@@ -8,14 +8,14 @@ from worker.play.rollout import play
 
 
 class FixedTests:
-    """Test episodes that are the same whoever plays them, `at_once` of them at a time.
+    """A fixed set of test episodes, the same for every policy, played `at_once` at a time.
 
-    The first ones of a larger set are those of a smaller one. `role` and `seed` name the set; by
-    default it is the fixed one, the same in every run.
+    A smaller set is the beginning of a larger one. `role` and `seed` select the set; the default is
+    the one that evaluators use in every run.
 
     Attributes:
-        task: what is played.
-        env: where they are played.
+        task: the task of the episodes.
+        env: the environments.
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class FixedTests:
         self.env = task.make(min(at_once, episodes), "test")
 
     def play(self, choose: Chooser, go_on: Callable[[], bool] = lambda: True) -> Played:
-        """All episodes, fewer if `go_on` says so; see `rollout.play`."""
+        """Play all episodes with the policy `choose`; `go_on` as in `rollout.play`."""
         return play(
             self.env,
             self.task.spec,

@@ -1,4 +1,4 @@
-"""A worker's end of the conversation with the master, and where that is.
+"""The worker's side of the protocol, and how a worker finds its master.
 
 Start with `client.py`. Imports no other folder of worker.
 """

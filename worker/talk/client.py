@@ -1,11 +1,11 @@
-"""A worker's end of the conversation with the master: batches out, weights in.
+"""The worker's side of the protocol: sends batches of episodes, receives weights.
 
-Delivery: a batch is sent again, with all that are unacknowledged and in order, after each WELCOME
-(a new connection, a restarted master), when the master got one out of turn, and when no
-acknowledgement came for a while. The master drops what it has already.
+Delivery: all unacknowledged batches are sent again, in order, after each WELCOME (a new connection
+or a restarted master), when the master got a batch out of turn, and when no acknowledgement came
+for a while. The master drops batches that it already has.
 
-Nothing here waits without looking at `stopped` every STEP_S, so a signal handler that calls `stop`
-ends each wait.
+Every wait checks `stopped` at least every STEP_S seconds, so a signal handler that calls `stop`
+ends any wait.
 """
 
 import logging
@@ -47,32 +47,32 @@ from worker.talk.connection import Connection, Sockets, Timing
 from worker.talk.outbox import NewestWeights, Outbox
 
 STEP_S = 0.1
-# Between two log lines of what is waited for.
+# Seconds between two log lines about a wait.
 TELL_S = 60.0
-# Times `Timing.resend_s`: the longest that is waited before all is sent again.
+# Longest wait before all batches are sent again, in units of `Timing.resend_s`.
 MOST_PATIENCE = 8.0
 
 log = logging.getLogger(__name__)
 
 
 class Client:
-    """One process's conversation; made without any I/O, `join` starts it.
+    """Protocol client of one worker; the constructor does no I/O, `join` connects.
 
     Args:
         connect: host:port, a connection file, or a run folder that holds one.
         role: player or evaluator.
-        index: wanted within the role, -1 for any.
-        fingerprints: section of the settings -> digest, which the master compares.
-        spec: the task that arrays are checked against.
-        shapes: of the tensors that weights must have; None takes any.
-        window: most batches kept unacknowledged; the master's own bound holds as well.
-        timing: patience.
+        index: wanted number within the role; -1 for any.
+        fingerprints: section of the settings -> digest, compared by the master.
+        spec: shapes that episodes are checked against.
+        shapes: required shapes of the weight tensors; None accepts any.
+        window: upper bound of unacknowledged batches; the bound of the master applies, too.
+        timing: timeouts.
 
     Attributes:
-        stats: numbers that the next heartbeats tell the master, to be set.
-        counters: what was sent again, refused, lost or not understood.
-        joined: the present connection is known to the master.
-        on_progress: called whenever the client is at work.
+        stats: numbers that the caller sets and the next heartbeats send to the master.
+        counters: counts of messages sent again, refused, lost or malformed.
+        joined: whether the master has accepted the present connection.
+        on_progress: called at every `poll`.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Client:
         self._order: Go | None = None
         self._again = False
         self._stop_reason = ""
-        # The master wants this process to end, and why.
+        # Whether the master has told this process to end, and its reason.
         self._dismissed, self._dismissal = False, ""
         self._hello_at = self._heartbeat_at = self._resend_at = 0.0
         self._patience_s = self._timing.resend_s
@@ -120,7 +120,7 @@ class Client:
 
     @property
     def acknowledged(self) -> int:
-        """Number of the last batch up to which all were acknowledged."""
+        """The largest n such that batches 1 to n are all acknowledged."""
         return self.outbox.first - 1
 
     @property
@@ -130,27 +130,27 @@ class Client:
 
     @property
     def stop_reason(self) -> str:
-        """Why it must end, empty while it need not."""
+        """Why this process must end; empty if it need not."""
         return self._stop_reason or self._dismissal
 
     @property
     def window_free(self) -> int:
-        """Batches that can be sent without waiting."""
+        """Number of batches that can be sent without waiting."""
         return self.outbox.free
 
     def stop(self, reason: str) -> None:
-        """Ask all waits to end; safe in a signal handler."""
+        """Make every wait end; safe in a signal handler."""
         self._stop_reason = self._stop_reason or reason or "stopped"
 
     def join(self) -> bool:
-        """Wait for the master and its WELCOME; False if `stop` was called meanwhile.
+        """Wait for the WELCOME of the master; False if `stop` was called meanwhile.
 
         Raises:
-            TangramError: no master in time, or it refused; the reason is the master's.
+            TangramError: no master answered in time, or the master refused and gave the reason.
         """
         patience = self._timing.join_s
         log.info(
-            "joins %s, waits %g s at most for its master",
+            "joins %s, waits at most %g s for its master",
             self._connection.place,
             patience,
             extra={"event": "joining"},
@@ -161,15 +161,15 @@ class Client:
         return joined
 
     def poll(self, timeout_s: float = 0.0) -> None:
-        """Take what came, send what is due; waits at most so long for something to come.
+        """Handle received messages and send what is due; wait at most `timeout_s` for a message.
 
         Raises:
-            TangramError: the master refuses this process, is one of another run, or did not answer
-                for `lost_s`.
+            TangramError: the master refuses this process, belongs to another run, or has not
+                answered for `Timing.lost_s` seconds.
         """
         self.on_progress()
         sockets = self._connection.sockets or self._open()
-        if sockets is None:  # nothing to wait for but the file
+        if sockets is None:  # the connection file is still missing
             time.sleep(timeout_s)
         else:
             sockets.wait(timeout_s)
@@ -181,10 +181,10 @@ class Client:
         self._connection.check_lost(time.monotonic())
 
     def send(self, episodes: Episodes, weights_version: int) -> bool:
-        """Send a batch when the window has room; False, and it is not sent, if stopped before.
+        """Send a batch once the window has room; False if stopped before it was sent.
 
         Raises:
-            WireError: the batch breaks the task's bounds; names the field.
+            WireError: a value is outside the bounds of the task; the message names the field.
         """
         if not self.wait_for_window():
             return False
@@ -197,27 +197,27 @@ class Client:
         return True
 
     def wait_for_window(self) -> bool:
-        """Wait until a batch may be sent; False if stopped."""
+        """Wait until the window has room for a batch; False if stopped."""
         return self._wait(lambda: self.outbox.free > 0, "the master to take what was played")
 
     def send_scores(self, scores: Scores) -> None:
-        """Send the results of an evaluation, once; they are lost if no master is there."""
+        """Send the scores of an evaluation once; they are lost if no master is connected."""
         if not self._post(scores.encode(self._spec)):
             self.counters["lost_scores"] += 1
 
     def newest_weights(self) -> Weights | None:
-        """The newest weights that came, None if they were returned before."""
+        """The newest received weights; None if they were already returned."""
         return self.newest.take()
 
     def wait_for_weights(self) -> Weights | None:
-        """Wait for newer weights; None if stopped."""
+        """Wait for newer weights and return them; None if stopped."""
         waited = self._wait(lambda: self.newest.waits, "newer weights")
         return self.newest.take() if waited else None
 
     def wait_for_order(self, done: Go | None) -> Go | None:
-        """In lockstep: wait for what to play after an order that was done; None if stopped.
+        """In lockstep: wait for the order that follows `done`; None if stopped.
 
-        It is the same order again if what was played for it was refused.
+        The same order is returned again if the batch played for it was refused.
         """
 
         def is_new() -> bool:
@@ -230,7 +230,7 @@ class Client:
         return self._order
 
     def close(self) -> None:
-        """Say BYE and close; takes a second at most, also when nobody listens."""
+        """Say BYE and close the connection; takes at most a second, even without a master."""
         if self._connection.sockets is not None:
             self._connection.sockets.send(Bye(self.stop_reason or "done").encode())
         self._connection.close()
@@ -246,11 +246,13 @@ class Client:
             if now - told >= TELL_S:
                 told = now
                 lacks = self._connection.lacks(self.joined) or what
-                log.info("waits for %s since %.0f s", lacks, now - begun, extra={"event": "waits"})
+                log.info(
+                    "waits for %s, %.0f s so far", lacks, now - begun, extra={"event": "waits"}
+                )
             self.poll(min(STEP_S, timeout_s))
         return False
 
-    # What is said, and when
+    # Sending
 
     def _open(self) -> Sockets | None:
         if self._connection.open() and self._connection.sockets is not None:
@@ -292,14 +294,15 @@ class Client:
         sockets.send(question.encode())
 
     def _post(self, frames: list[bytes]) -> bool:
-        """Send to a master that knows this connection; False if that was not possible."""
+        """Send if joined and if the socket has room; otherwise False."""
         sockets = self._connection.sockets
         return self.joined and sockets is not None and sockets.send(frames)
 
     def _resend(self, now: float) -> None:
-        """Send all again, and next time later: a master that is behind has it already.
+        """Send all batches again, and double the wait until the next time.
 
-        What was lost is sent again at once after a WELCOME, and soon after a REJECT.
+        A master that is only slow already has the batches. Batches that were really lost are sent
+        again at once after a WELCOME, and soon after a REJECT.
         """
         self._patience_s = min(2.0 * self._patience_s, MOST_PATIENCE * self._timing.resend_s)
         self._resend_at = now + self._patience_s
@@ -311,14 +314,14 @@ class Client:
             self._post(frames)
 
     def _be_patient(self, now: float) -> None:
-        """Count the time until all is sent again from now on, as in the beginning."""
+        """Restart the resend timer with its shortest wait."""
         self._patience_s = self._timing.resend_s
         self._resend_at = now + self._patience_s
 
     def _want_weights(self) -> None:
         self._post(WantWeights(self.newest.epoch, self.newest.version).encode())
 
-    # What is heard
+    # Receiving
 
     def _receive(self, frames: list[bytes]) -> None:
         try:
@@ -327,10 +330,10 @@ class Client:
             raise
         except WireError as error:
             self.counters["malformed"] += 1
-            self._warn("malformed", "the master at %s sent what is not understood: %s", error)
+            self._warn("malformed", "a message of the master at %s cannot be decoded: %s", error)
             return
         self._connection.answered()
-        if not isinstance(message, RunStatus):  # nobody asked for one here
+        if not isinstance(message, RunStatus):  # a worker never asks for a status
             self._handle(message, time.monotonic())
 
     def _receive_weights(self, sockets: Sockets) -> None:
@@ -353,7 +356,7 @@ class Client:
             case Go():
                 self._order = message
             case Alive(version):
-                if self.newest.version < version:  # the broadcast was missed, or is on its way
+                if self.newest.version < version:  # the broadcast was missed or is still coming
                     self._want_weights()
             case WeightsMessage(epoch, weights):
                 self.newest.offer(epoch, weights)
@@ -361,7 +364,7 @@ class Client:
                 self._handle_membership(message, now)
 
     def _handle_membership(self, message: ToWorker, now: float) -> None:
-        """Handle an answer that says whether this process takes part."""
+        """Handle an answer that accepts, questions, stops or refuses this process."""
         match message:
             case Welcome():
                 self._take_part(message, now)
@@ -384,7 +387,7 @@ class Client:
         if wanted and wanted != welcome.run_id:
             raise TangramError(
                 f"the master at {address.endpoint} runs '{welcome.run_id}', not '{wanted}': the "
-                "connection file is stale, take the one of a master that is running"
+                "connection file is stale, use the one of a master that is running"
             )
         self._welcome, self.joined, self._connection.keys_refused = welcome, True, False
         self.outbox.window = min(self._window, welcome.window)

@@ -1,4 +1,4 @@
-"""The connection to the master: DEALER and SUB, made anew when it is silent or takes no keys."""
+"""The connection to the master; it is opened again after silence or a failed handshake."""
 
 import logging
 import math
@@ -24,11 +24,11 @@ from worker.talk.discovery import (
 )
 
 LINGER_MS = 1000
-# More than any window, so that only heartbeats to a master that is away find no room.
+# Larger than any window, so only heartbeats to an absent master can fill the queue.
 HIGH_WATER = 2048
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 2000
-SURE = 8  # handshakes in a row that failed without a reason: some fail when many come at once
+SURE = 8  # unexplained failed handshakes that mean wrong keys; under load a few fail anyway
 HANDSHAKES = (
     zmq.EVENT_HANDSHAKE_FAILED_AUTH
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -41,16 +41,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Timing:
-    """Patience, in seconds.
+    """Timeouts and intervals, in seconds.
 
     Attributes:
-        join_s: to find the master at the start.
+        join_s: longest wait for the master at the start.
         retry_s: between two HELLOs, and before a resend that the master asked for.
-        heartbeat_s: between two signs of life.
-        resend_s: without an acknowledgement before all is sent again, twice as long each time after
-            that, up to eight times.
-        silence_s: without an answer before the connection is made anew.
-        lost_s: without an answer, over all connections, before giving up.
+        heartbeat_s: between two heartbeats.
+        resend_s: without an acknowledgement until all batches are sent again. The wait doubles each
+            time, up to eight times this value.
+        silence_s: without an answer until the connection is closed and opened again.
+        lost_s: without an answer, over all connections, until the worker gives up.
     """
 
     join_s: float = PATIENCE_S
@@ -62,16 +62,16 @@ class Timing:
 
 
 class Sockets:
-    """A DEALER for messages, and one SUB for weights that keeps the newest frame only.
+    """A DEALER socket for messages, and a SUB socket that keeps only the newest weights.
 
-    Each DEALER has a new identity: a ROUTER ignores a second connection of an identity that it
-    believes alive.
+    Each DEALER gets a new identity, because a ROUTER ignores a second connection with an identity
+    that seems to be still connected.
     """
 
     def __init__(
         self, context: zmq.Context[zmq.Socket[bytes]], address: MasterAddress, role: str = ""
     ) -> None:
-        """Connect with the key of a role, or with any; RunError if there is none for it."""
+        """Connect with the key of `role`, or any key if empty; RunError if the key is missing."""
         self._context, self._address = context, address
         self._key = _key_of(address, role)
         self._sub: zmq.Socket[bytes] | None = None
@@ -80,14 +80,14 @@ class Sockets:
         self._poller = zmq.Poller()
         self._ready: set[zmq.Socket[bytes]] = set()
         self._dealer = self._open(zmq.DEALER)
-        # The first byte must not be zero.
+        # ZeroMQ forbids identities that begin with a zero byte.
         self._dealer.setsockopt(zmq.IDENTITY, b"w" + secrets.token_bytes(16))
         self._monitor = self._dealer.get_monitor_socket(HANDSHAKES)
         self._poller.register(self._monitor, zmq.POLLIN)
         self._connect(self._dealer, address.endpoint)
 
     def subscribe(self, weights_endpoint: str) -> None:
-        """Subscribe to the weights of this address only."""
+        """Subscribe to the weights broadcast at this address, and end any other subscription."""
         if weights_endpoint == self._weights_endpoint:
             return
         self._drop_sub()
@@ -98,7 +98,7 @@ class Sockets:
         self._weights_endpoint = weights_endpoint
 
     def wait(self, timeout_s: float) -> None:
-        """Return when something came, or after this time; what came is looked at after this."""
+        """Wait for input, at most `timeout_s`; the other methods read only what this call found."""
         events = self._poller.poll(math.ceil(max(0.0, timeout_s) * 1000))
         self._ready = {socket for socket, _ in events}
 
@@ -111,7 +111,7 @@ class Sockets:
         return True
 
     def messages(self) -> Iterator[list[bytes]]:
-        """What the master had answered by the last `wait`, and what comes meanwhile."""
+        """Messages that had come by the last `wait`, and those that come while iterating."""
         if self._dealer not in self._ready:
             return
         while True:
@@ -122,7 +122,7 @@ class Sockets:
             yield frames
 
     def weights(self) -> bytes | None:
-        """The newest broadcast that was there at the last `wait`."""
+        """The newest broadcast frame if the last `wait` found one, else None."""
         if self._sub is None or self._sub not in self._ready:
             return None
         try:
@@ -131,10 +131,10 @@ class Sockets:
             return None
 
     def handshake_failed(self) -> bool:
-        """Whether the two sides do not agree on encryption and keys.
+        """Whether the handshake failed because encryption or keys do not match.
 
-        A wrong key of the master looks like a connection that was lost in the handshake: only
-        several of these count.
+        A wrong master key looks like a connection lost during the handshake, so a single such event
+        proves nothing: SURE of them count as a failure.
         """
         if self._monitor not in self._ready:
             return False
@@ -146,7 +146,7 @@ class Sockets:
         return failed
 
     def close(self, linger_ms: int = 0) -> None:
-        """Close both sockets; queued messages get this long to leave."""
+        """Close both sockets; queued messages have `linger_ms` to be sent."""
         self._drop_sub()
         self._dealer.disable_monitor()
         self._monitor.close(0)
@@ -186,25 +186,25 @@ class Sockets:
 
 
 def _key_of(address: MasterAddress, role: str) -> tuple[str, str] | None:
-    """The key to show; None where none is wanted."""
+    """Public and secret key to connect with; None without encryption."""
     if not address.keys:
         return None
     if role and role not in address.keys:
         there = " and ".join(address.keys)
         raise RunError(
             f"the connection file of {address.endpoint} has a key for role={there} only: add "
-            f"role={there}, or ask for one for role={role} (tangram-keys)"
+            f"role={there}, or ask for a key for role={role} (made by tangram-keys)"
         )
     return address.keys[role] if role else next(iter(address.keys.values()))
 
 
 class Connection:
-    """One pair of sockets at a time; the next one may have another address.
+    """One pair of sockets at a time; a later pair may have another address.
 
     Attributes:
-        sockets: the present ones, None before the address is known.
-        address: where they lead.
-        keys_refused: the last handshake failed, because keys do not fit.
+        sockets: the present pair; None before the address is known.
+        address: the master's address; None while unknown.
+        keys_refused: whether the last handshake failed because the keys are wrong.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class Connection:
         self._connect, self._timing, self._counters = connect, timing, counters
         self._role = role
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        # Since when an answer is due on this connection, and on all since the last answer.
+        # Since when an answer is due: on this connection, and over earlier silent connections.
         self._asked_at: float | None = None
         self._lost_at: float | None = None
         self._reopen_at, self._follow_at = math.inf, 0.0
@@ -224,11 +224,11 @@ class Connection:
 
     @property
     def place(self) -> str:
-        """Where the master is, as far as known."""
+        """The master's address if known, else the setting `connect`."""
         return self.address.endpoint if self.address else self._connect
 
     def lacks(self, joined: bool) -> str:
-        """What this process waits for, empty while the master answers one that has `joined`."""
+        """What this process waits for; empty if it has joined and the master answers."""
         if self.address is None:
             return f"the connection file {self._connect}"
         if not joined or self._lost_at is not None:
@@ -236,7 +236,7 @@ class Connection:
         return ""
 
     def no_master(self, patience_s: float) -> TangramError:
-        """The error that no master could be joined for this long, for the user."""
+        """The error for the user: no master could be joined within `patience_s`."""
         if self.keys_refused:
             return TangramError(keys_error(self._connect, self.place))
         if self.address is None:
@@ -250,7 +250,7 @@ class Connection:
         )
 
     def open(self) -> bool:
-        """Connect to where the master is now; False while that is not known."""
+        """Connect to the present address of the master; False while it is unknown."""
         before, self.address = self.address, find_master(self._connect)
         if self.address is None:
             return False
@@ -260,13 +260,13 @@ class Connection:
         return True
 
     def _look_up(self, endpoint: str) -> None:
-        """Warn of a host that DNS does not know, or not yet: ZeroMQ tries again without a word."""
+        """Warn if DNS does not know the host (yet); ZeroMQ itself would retry silently."""
         before, self._unknown_host = self._unknown_host, host_error(endpoint, self._connect)
         if self._unknown_host and not before:
             log.warning("%s", self._unknown_host, extra={"event": "unknown_host"})
 
     def drop(self) -> None:
-        """Close a connection that brings no answers."""
+        """Close a connection that gives no answers."""
         self._counters["reconnects"] += 1
         if self._lost_at is None:
             self._lost_at = self._asked_at
@@ -276,18 +276,18 @@ class Connection:
             self.sockets = None
 
     def asked(self, now: float) -> None:
-        """Note that a message was sent that asks for an answer."""
+        """Record that a message was sent which needs an answer."""
         if self._asked_at is None:
             self._asked_at = now
 
     def answered(self) -> None:
-        """Note that a message came."""
+        """Record that a message of the master arrived."""
         if self._lost_at is not None:
             log.info("the master at %s answers again", self.place, extra={"event": "found_again"})
         self._asked_at = self._lost_at = None
 
     def watch(self, now: float) -> None:
-        """Note a master that moved, and a handshake that failed: its file may change, too."""
+        """Plan to connect again if the master has a new address or a handshake has failed."""
         self._follow(now)
         if self.sockets is None or not self.sockets.handshake_failed():
             return
@@ -299,7 +299,7 @@ class Connection:
         self.keys_refused, self._reopen_at = True, now + self._timing.retry_s
 
     def is_dead(self, now: float, joined_before: bool) -> bool:
-        """Whether to try another connection; silence is news where a master has answered before."""
+        """Whether to try another connection; warn of silence if a master had answered before."""
         silent = self._asked_at is not None and now - self._asked_at > self._timing.silence_s
         if silent and joined_before and self._lost_at is None and not self.keys_refused:
             log.warning(
@@ -312,20 +312,20 @@ class Connection:
         return silent or now >= self._reopen_at
 
     def _follow(self, now: float) -> None:
-        """A master that was started again writes its new address into the same file."""
+        """Plan to connect again if the connection file has a new address, as after a restart."""
         if now < self._follow_at:
             return
         self._follow_at = now + self._timing.retry_s
         try:
             found = find_master(self._connect)
         except RunError:
-            return  # by the next look it may be whole
+            return  # perhaps half written: look again next time
         if found is not None and found != self.address:
             log.info("the master is at %s now", found.endpoint, extra={"event": "moved"})
             self._reopen_at = now
 
     def check_lost(self, now: float) -> None:
-        """Raise UnavailableError if no connection brought an answer for too long."""
+        """Raise UnavailableError after `lost_s` without an answer, over all connections."""
         if self._lost_at is not None and now - self._lost_at > self._timing.lost_s:
             raise UnavailableError(
                 f"the master at {self.place} has not answered for {self._timing.lost_s:g} s: "
@@ -333,7 +333,7 @@ class Connection:
             )
 
     def close(self) -> None:
-        """Close; what is queued gets a second."""
+        """Close the connection; queued messages have a second to be sent."""
         if self.sockets is not None:
             self.sockets.close(LINGER_MS)
             self.sockets = None

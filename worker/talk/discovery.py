@@ -1,4 +1,4 @@
-"""Where the master is: an address, or the connection file that it writes into its run folder."""
+"""How to find a master: by its address, or by the connection file in its run folder."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from tangram_core.store.files import check_own
 from tangram_core.wire.addresses import IPC, dns_error
 
 FILE_NAME = "connection.json"
-# A master may still be starting, or wait in a queue.
+# The master may still be starting, or waiting in the queue of a cluster.
 PATIENCE_S = 60.0
 LOOK_S = 0.2
 SCHEME = "tcp://"
@@ -28,14 +28,14 @@ KEY_BYTES = 32
 
 @dataclass(frozen=True)
 class MasterAddress:
-    """Where a master listens, and what it takes to be let in.
+    """Address of a master, and the keys to authenticate with.
 
     Attributes:
-        endpoint: of its ROUTER socket.
-        run_id: that it must have, empty where any will do.
-        server_key: the master's public CURVE key, empty where nothing is encrypted.
-        keys: role -> public and secret key, of those that may take part in it.
-        settings: section -> those of the run; None where only an address is known.
+        endpoint: ZeroMQ address of the master's ROUTER socket.
+        run_id: expected id of the run; empty accepts any.
+        server_key: the master's public CURVE key; empty without encryption.
+        keys: role -> public and secret key of a worker in this role.
+        settings: section -> settings of the run; None if only an address is known.
     """
 
     endpoint: str
@@ -51,15 +51,15 @@ class MasterAddress:
                 _check_key(f"keys.{role}.public", public)
                 _check_key(f"keys.{role}.secret", secret)
             if not self.keys:
-                raise ValueError("it has a server_key, and no keys")
+                raise ValueError("it has a server_key but no keys")
         if not isinstance(self.settings, Mapping | None):
             raise ValueError("settings must be a map")
 
 
 def as_address(connect: str) -> str | None:
-    """The address that `connect` names, as tcp://host:port; None where it names a file.
+    """The address in `connect`, as tcp://host:port; None if `connect` names a file.
 
-    host:port is an address unless a file here is called so.
+    host:port is an address unless a file of this name exists.
     """
     if "://" in connect:
         return connect
@@ -68,12 +68,12 @@ def as_address(connect: str) -> str | None:
 
 
 def find_master(connect: str) -> MasterAddress | None:
-    """The master's address; None while its file, or the folder of its sockets, is not there.
+    """The master's address; None while the connection file or the folder of sockets is missing.
 
     `connect` is host:port with or without tcp://, a connection file, or a run folder with one.
 
     Raises:
-        RunError: neither an address nor a readable connection file.
+        RunError: `connect` is neither an address nor a readable connection file.
     """
     address = as_address(connect)
     if address is not None:
@@ -84,7 +84,7 @@ def find_master(connect: str) -> MasterAddress | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         endpoint, run_id = str(content["endpoint"]), str(content["run_id"])
-        f"{endpoint}{run_id}".encode()  # half a character is no text
+        f"{endpoint}{run_id}".encode()  # raises UnicodeEncodeError for a lone surrogate
         if endpoint.startswith(f"{IPC}/"):
             _check_local(endpoint, str(content["machine"]), path)
         else:
@@ -97,7 +97,7 @@ def find_master(connect: str) -> MasterAddress | None:
         return None
     except UNREADABLE as error:
         raise RunError(
-            f"{path} is no connection file ({_why(error)}): connect=... takes host:port, a run "
+            f"{path} is no connection file ({_why(error)}): set connect=... to host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
         ) from None
 
@@ -105,11 +105,11 @@ def find_master(connect: str) -> MasterAddress | None:
 def await_master(
     connect: str, tell: Callable[[str], None], patience_s: float = PATIENCE_S
 ) -> MasterAddress:
-    """The master's address, also when its file is written later; `tell` takes a line for the user.
+    """Wait for the connection file and return the master's address; `tell` prints a line.
 
     Raises:
-        RunError: neither an address nor a readable connection file.
-        UnavailableError: none in time.
+        RunError: `connect` is neither an address nor a readable connection file.
+        UnavailableError: no connection file after `patience_s` seconds.
     """
     until_s = time.monotonic() + patience_s
     told = False
@@ -118,8 +118,8 @@ def await_master(
             raise UnavailableError(no_file_error(connect, patience_s))
         if not told:
             ended = (Path(connect) / RESULT).is_file()
-            note = f"run {Path(connect).name} has ended, unless its master goes on with it: "
-            wait = f"waits for the connection file {connect}, for {patience_s:g} s at most"
+            note = f"run {Path(connect).name} has ended, unless its master resumes it: "
+            wait = f"waits at most {patience_s:g} s for the connection file {connect}"
             tell(note * ended + wait)
             told = True
         time.sleep(LOOK_S)
@@ -127,39 +127,39 @@ def await_master(
 
 
 def no_file_error(connect: str, patience_s: float) -> str:
-    """The error that there is no connection file, for the user."""
+    """Error message: there is no connection file."""
     return (
-        f"no connection file is at {connect} after {patience_s:g} s, or none whose sockets are "
-        "there: is tangram-master running there?"
+        f"no connection file is at {connect} after {patience_s:g} s, or its sockets do not exist: "
+        "is tangram-master running there?"
     )
 
 
 def host_error(endpoint: str, connect: str) -> str:
-    """What DNS says against the host of the master, for the user; empty where it knows it."""
+    """Error message: DNS does not know the master's host; empty if the host is known."""
     said = dns_error(endpoint)
     if not said or as_address(connect) is not None:
         return said and f"{said}: check the name in connect="
     return (
-        f"{said}: it is the master's service.host and stands in {connect}; start the master with a "
+        f"{said}: {connect} has this name from the master's service.host; start the master with a "
         "name or an address that this machine knows"
     )
 
 
 def keys_error(connect: str, endpoint: str) -> str:
-    """The error that a handshake fails, for the user, with what `connect` names."""
+    """Error message: the handshake failed; its remedy depends on what `connect` names."""
     if as_address(connect) is not None:
         return (
-            f"the master at {endpoint} wants keys, or is none: name its connection file instead, "
-            f"connect=RUN_DIR/{FILE_NAME}, or one that tangram-keys made"
+            f"the master at {endpoint} wants keys, or is no master: set connect to its connection "
+            f"file, connect=RUN_DIR/{FILE_NAME}, or to one that tangram-keys made"
         )
     return (
-        f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
-        f"{connect}, of another run or revoked; take the file of a master that is running"
+        f"wrong or stale connection file: the master at {endpoint} refuses the keys in {connect}, "
+        "which are of another run or revoked; use the file of a master that is running"
     )
 
 
 def _why(error: Exception) -> str:
-    """What is wrong with a file, for the user."""
+    """What is wrong with a connection file, in words for the user."""
     match error:
         case json.JSONDecodeError() | UnicodeDecodeError():
             return "it is not JSON"
@@ -168,12 +168,12 @@ def _why(error: Exception) -> str:
         case KeyError():
             return f"it has no {error.args[0]}"
         case TypeError() | AttributeError():
-            return "its content is another one"
+            return "its values have the wrong types"
     return str(getattr(error, "strerror", None) or error)
 
 
 def _check_key(name: str, key: str) -> None:
-    """Raise ValueError, without what may be a secret, for what ZeroMQ takes for no key."""
+    """Raise ValueError unless `key` is a CURVE key; the message hides it, it may be secret."""
     try:
         whole = len(z85.decode(key)) == KEY_BYTES
     except (ValueError, KeyError, struct.error):
@@ -183,19 +183,19 @@ def _check_key(name: str, key: str) -> None:
 
 
 def _check_local(endpoint: str, machine: str, source: Path) -> None:
-    """Look, and change nothing, whether only this user can listen there.
+    """Check, without changing anything, that only this user can listen at a local socket.
 
     Raises:
-        RunError: the master listens on another machine, or perhaps another user does.
-        FileNotFoundError: the folder is not there; another user could make it.
+        RunError: the master is on another machine, or another user may own the socket.
+        FileNotFoundError: the folder of the socket is missing, so any user could create it.
     """
     place = endpoint.removeprefix(IPC)
     if ".." in Path(place).parts:
         raise ValueError(f"its endpoint '{endpoint}' must be a path without '..'")
     if machine != socket.gethostname() and not Path(place).exists():
         raise RunError(
-            f"{source}: this master listens on its own machine, {machine}, only: start it there "
-            "with service.bind=0.0.0.0, or start this there"
+            f"{source}: this master listens only on its own machine, {machine}: start the master "
+            f"with service.bind=0.0.0.0, or start this command on {machine}"
         )
     check_own(Path(place).parent)
 
@@ -205,7 +205,7 @@ def _checked(endpoint: str, source: str) -> str:
     named = endpoint.startswith(SCHEME) and host.isprintable() and host.split() == [host]
     if not (named and port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
         raise RunError(
-            f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port, the port "
+            f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port, with a port "
             "from 1 to 65535"
         )
     return endpoint

@@ -1,4 +1,4 @@
-"""What a worker keeps: batches until the master has them, and the newest weights."""
+"""Buffers of a worker: unacknowledged batches, and the newest weights."""
 
 from tangram_core.agent import Weights
 from tangram_core.wire.arrays import WeightShapes
@@ -6,10 +6,10 @@ from tangram_core.wire.messages import decode_weights
 
 
 class Outbox:
-    """Unacknowledged messages by number, in the order of their first sending; never over a window.
+    """Unacknowledged messages by number, in the order of sending; at most `window` of them.
 
     Attributes:
-        window: most messages that may be kept.
+        window: upper bound of the messages kept.
         next: number of the next message, from 1.
     """
 
@@ -23,33 +23,33 @@ class Outbox:
 
     @property
     def first(self) -> int:
-        """Number of the oldest message kept, or of the next where there is none."""
+        """Number of the oldest message kept, or of the next one if the outbox is empty."""
         return next(iter(self._messages), self.next)
 
     @property
     def free(self) -> int:
-        """Messages that may be added now."""
+        """How many messages may be added now."""
         return max(0, self.window - len(self._messages))
 
     @property
     def messages(self) -> list[list[bytes]]:
-        """All that must be sent again, oldest first."""
+        """The frames of all messages kept, oldest first."""
         return list(self._messages.values())
 
     def add(self, frames: list[bytes]) -> None:
-        """Keep the next message; the caller has seen to it that there is room."""
+        """Add the next message; the caller must check `free` before."""
         self._messages[self.next] = frames
         self.next += 1
 
     def remove(self, sequence: int) -> bool:
-        """Forget a message; False if it was not kept, as after a second acknowledgement."""
+        """Remove a message; False if it is not there, as after a second acknowledgement."""
         return self._messages.pop(sequence, None) is not None
 
 
 class NewestWeights:
-    """The newest weights of the master's present life, whichever way they came, until taken.
+    """The newest weights that were broadcast or answered, until they are taken.
 
-    Weights of another epoch are dropped; before the first the version is -1.
+    Weights of another epoch (one start of the master) are dropped. The version is -1 at first.
     """
 
     def __init__(self, shapes: WeightShapes | None) -> None:
@@ -60,11 +60,11 @@ class NewestWeights:
 
     @property
     def waits(self) -> bool:
-        """Whether weights wait to be taken."""
+        """Whether there are weights that were not taken yet."""
         return self._fresh is not None
 
     def begin(self, epoch: str) -> None:
-        """Note the master's epoch; a restarted master has another, and versions start anew."""
+        """Set the epoch; in a new epoch (a restarted master) versions begin again."""
         if epoch != self.epoch:
             self.epoch, self.version, self._fresh = epoch, -1, None
 
@@ -78,6 +78,6 @@ class NewestWeights:
             self.version, self._fresh = weights.version, weights
 
     def take(self) -> Weights | None:
-        """The newest weights, unless they were taken before."""
+        """The newest weights; None if they were already taken."""
         fresh, self._fresh = self._fresh, None
         return fresh

@@ -1,4 +1,4 @@
-"""DDPG, TD3 and SAC for goals: settings, without tensors."""
+"""The agent of DDPG, TD3 and SAC, and its settings; does not import torch."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -14,38 +14,42 @@ if TYPE_CHECKING:  # these load torch
 
 @dataclass(frozen=True)
 class GoalConfig(BaseConfig, section="agent"):
-    """Which algorithm, and what it has beside what all have."""
+    """The algorithm and its own settings."""
 
     algorithm: str = setting(
         "td3",
-        "one critic (ddpg), the lesser of two and a delayed actor (td3), or also an actor that is "
-        "random by itself (sac)",
+        "ddpg: one critic; td3: the lower value of two critics and a delayed actor; sac: the lower "
+        "value of two critics and a stochastic actor",
         choices=("ddpg", "td3", "sac"),
         part=NETWORK,
     )
     action_penalty: float = setting(
-        0.1, "weight in the actor's loss of squared actions", low=0, part=LEARNING
+        0.1, "weight of squared actions in the actor's loss", low=0, part=LEARNING
     )
     actor_delay: int = setting(
-        2, "updates for each one of the actor", low=1, only={"algorithm": "td3"}, part=LEARNING
+        2,
+        "updates of the critics for each update of the actor",
+        low=1,
+        only={"algorithm": "td3"},
+        part=LEARNING,
     )
 
 
 @dataclass(frozen=True)
 class Goal(ActorCriticAgent):
-    """Learns any task whose fields are numbers, from its own goals and by hindsight."""
+    """DDPG, TD3 or SAC with hindsight, for any task whose fields are numbers."""
 
     sections: ClassVar = {"agent": GoalConfig}
     config: GoalConfig = GoalConfig()
 
     def learns(self) -> "type[GoalLearner]":
-        """One learner for the three: they differ in a few lines of their losses."""
+        """The learner's class, one for all three algorithms."""
         from tangram_agent.agents.goal.learner import GoalLearner  # noqa: PLC0415
 
         return GoalLearner
 
     def policy(self, inputs: int, actions: int) -> "Policy":
-        """Random by itself where the algorithm is SAC."""
+        """A deterministic policy, or a Gaussian one for SAC."""
         if self.config.algorithm != "sac":
             return super().policy(inputs, actions)
         from tangram_agent.agents.goal.gaussian import GaussianPolicy  # noqa: PLC0415

@@ -13,43 +13,43 @@ from tangram_agent.flat.config import BaseConfig
 from tangram_agent.flat.networks import Policy
 from tangram_agent.nets.networks import perceptron, untraced
 
-LOWEST, HIGHEST = -5.0, 2.0  # of the logarithm of a deviation
+LOWEST, HIGHEST = -5.0, 2.0  # bounds of the logarithm of a standard deviation
 
 
 class GaussianPolicy(Policy):
-    """Mean and deviation of actions before tanh (Haarnoja et al. 2018, appendix C)."""
+    """Mean and standard deviation of actions before tanh (Haarnoja et al. 2018, appendix C)."""
 
     def __init__(self, inputs: int, actions: int, config: BaseConfig) -> None:
         super().__init__(inputs, actions, config)
         self.layers = perceptron(inputs, config.hidden, 2 * actions, norm=True)
 
     def forward(self, rows: Tensor) -> Tensor:
-        """(B, A) the mean's action."""
+        """Actions (B, A) of the mean, after tanh."""
         untraced()
         return torch.tanh(self.layers(rows)[:, : self.actions])
 
     def explore(self, rows: Tensor, normals: Tensor) -> Tensor:
-        """(B, A) as it draws them."""
+        """Random actions (B, A) from standard normals (B, A)."""
         return self.drawn(rows, normals)[0]
 
     def drawn(self, rows: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions (B, A) of standard normals (B, A), and their logarithmic densities (B,)."""
+        """Random actions (B, A) from standard normals (B, A), and their log densities (B,)."""
         mean, raw = self.layers(rows).chunk(2, dim=-1)
         log_deviation = LOWEST + (HIGHEST - LOWEST) * torch.sigmoid(raw)
         before = mean + log_deviation.exp() * normals
-        # log N - log(1 - tanh^2), the latter by 2 (log 2 - u - softplus(-2u)): exact far out.
+        # log N - log(1 - tanh^2 u); the latter as 2 (log 2 - u - softplus(-2u)), exact for large u.
         density = -0.5 * normals.square() - log_deviation - 0.5 * math.log(2.0 * math.pi)
         squashed = 2.0 * (math.log(2.0) - before - softplus(-2.0 * before))
         return torch.tanh(before), (density - squashed).sum(dim=-1)
 
 
 class Temperature(nn.Module):
-    """What entropy is worth, learned by its logarithm."""
+    """The weight of the entropy, learned as its logarithm."""
 
     def __init__(self) -> None:
         super().__init__()
         self.logarithm = nn.Parameter(torch.tensor(math.log(0.1)))
 
     def forward(self) -> Tensor:
-        """()."""
+        """The temperature ()."""
         return self.logarithm.exp()

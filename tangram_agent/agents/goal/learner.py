@@ -14,19 +14,19 @@ from tangram_agent.agents.goal.gaussian import GaussianPolicy, Temperature
 from tangram_agent.flat.actor_critic import ActorCritic, Batch, Loss
 from tangram_agent.flat.networks import Critics
 
-SMOOTHING, MOST_SMOOTHED = 0.2, 0.5  # of noise on actions in targets: Fujimoto et al. 2018
+SMOOTHING, MOST_SMOOTHED = 0.2, 0.5  # size and bound of target noise: Fujimoto et al. 2018
 
 
 class GoalLearner(ActorCritic[GoalConfig]):
-    """One of the three, as the settings say.
+    """Learner of the algorithm in the settings.
 
-    Target networks follow in every update; TD3's paper moves them with the actor alone.
+    Target networks follow in every update; the TD3 paper moves them only with the actor.
     """
 
     draws = 2
 
     def modules(self) -> dict[str, nn.Module]:
-        """Critics, and what SAC's entropy is worth."""
+        """The critics, and the temperature for SAC."""
         config = self.config
         count = 1 if config.algorithm == "ddpg" else 2
         self.critic = Critics(self.size, self.actions, config, count)
@@ -38,11 +38,11 @@ class GoalLearner(ActorCritic[GoalConfig]):
         return {"critic": self.critic, "temperature": self.temperature}
 
     def target_names(self) -> tuple[str, ...]:
-        """SAC asks the actor itself what comes next."""
+        """Names of the networks that have a target network; for SAC only the critics."""
         return ("critic",) if self.config.algorithm == "sac" else ("actor", "critic")
 
     def losses(self, batch: Batch) -> Iterator[Loss]:
-        """The critics first, then the actor by what they say."""
+        """Yield the loss of the critics, then those of the actor and the temperature."""
         with torch.no_grad():
             target = self._target(batch)
         values = self.critic(batch.rows, batch.actions)
@@ -72,7 +72,7 @@ class GoalLearner(ActorCritic[GoalConfig]):
                 actions = actions.clamp(-1.0, 1.0)
         value = self.targets["critic"](following, actions).amin(0) - bonus
         target = batch.rewards + config.gamma * batch.goes_on * value
-        # Entropy adds to what rewards come to, without a bound that is known.
+        # The entropy adds to the rewards, without a known bound.
         return target if config.algorithm == "sac" else self.bounded(target)
 
     def _entropic(self, batch: Batch) -> Iterator[Loss]:

@@ -1,5 +1,5 @@
-"""The agent that fills outlines whose pieces are not told.
+"""The agent that fills outlines without knowing the pieces of the target.
 
-Start with `filling.py`: what is left of an outline, and what may be laid next. `filler.py` acts,
-`learner.py` and `filling_replay.py` learn.
+Start with `filling.py`: the rest of an outline, and the possible next places of tokens. `filler.py`
+acts, `learner.py` and `filling_replay.py` learn.
 """

@@ -1,4 +1,4 @@
-"""Acting on outlines: the place whose rest is most surely filled.
+"""The actor for outlines: it plays the place after which the rest is most likely to be filled.
 
 Legend: B environments, G rows of an outline.
 """
@@ -28,7 +28,7 @@ class OutlineActor(NetworkActor):
         self._filler = Filler(self.network, task)
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
-        """Actions (B, A) on outlines (B, G, 2); where it explores a share of them goes anywhere."""
+        """Actions (B, A) for outlines (B, G, 2); while exploring, a share takes random places."""
         generators, share = explore or (), self._config.uniform_share
         drawn = [generator.random() < share for generator in generators]
         corners = np.asarray(seen["corners"], np.float64)

@@ -1,4 +1,4 @@
-"""The agent of outlines: a value of what is left to fill, whose actions are exact."""
+"""The agent for outlines: its actions are exact, and it learns a value of the resulting states."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
@@ -17,22 +17,22 @@ if TYPE_CHECKING:  # need torch
 
 @dataclass(frozen=True)
 class OutlineConfig(LearningConfig, section="agent"):
-    """Q-learning over afterstates, with hindsight."""
+    """Settings of Q-learning over afterstates with hindsight."""
 
     polyak: float = setting(0.99, "rho of the target network, Eq. 4", low=0, high=1, part=LEARNING)
-    copies: int = setting(6, "states of hindsight for each episode", low=1, high=64, part=LEARNING)
+    copies: int = setting(6, "hindsight states for each episode", low=1, high=64, part=LEARNING)
 
 
 @dataclass(frozen=True)
 class Outline(TokenAgent):
-    """It is told of no piece of the target."""
+    """An agent that sees the outline of the target, but not its pieces."""
 
     sections: ClassVar = {"agent": OutlineConfig, "net": NetConfig}
 
     config: OutlineConfig
 
     def check(self, task: Task) -> None:
-        """It fills outlines, by attention."""
+        """Refuse tasks without outlines, and networks without attention."""
         if not isinstance(task, Fill):
             raise ConfigError("agent.kind=outline fills outlines: set task=fill, or another agent")
         if self.net.kind == "mlp":
@@ -40,7 +40,7 @@ class Outline(TokenAgent):
         super().check(task)
 
     def check_training(self, *, compiled: bool = False) -> None:
-        """Refuse to compile."""
+        """Refuse compiled updates."""
         if compiled:
             refuse_ignored("service.compile=true", "agent.kind=outline", "leave it out", False)
 
@@ -51,7 +51,7 @@ class Outline(TokenAgent):
         return OutlineActor(cast("Fill", task), self.config, self.net)
 
     def learns(self) -> "type[FillLearner]":
-        """With a value alone."""
+        """The learner's class."""
         from tangram_agent.agents.outline.learner import FillLearner  # noqa: PLC0415
 
         return FillLearner

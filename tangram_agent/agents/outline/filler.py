@@ -1,6 +1,6 @@
-"""Acting on outlines: the place whose rest is most surely filled.
+"""Choice of the next token and its place, after which the rest is most likely to be filled.
 
-Where nothing fits any more, a token that is left goes to where it covers most of what is left.
+If no token fits any more, a remaining one goes to where it covers most of the rest.
 
 Legend: B environments, K tokens, V corners, G rows of an outline.
 """
@@ -26,12 +26,12 @@ from tangram_sim.geometry.rings import covered_area
 from tangram_sim.motion.actions import velocities_of
 from tangram_tasks.fill import Fill
 
-_ANGLES = 8  # that a token is tried at where nothing fits
-_FREE = 0.5  # of what a token may cover of others
+_ANGLES = 8  # tried for each token if none fits
+_FREE = 0.5  # share of MAX_OVERLAP that such a token may use
 
 
 class Filler:
-    """Chooses where the next token goes."""
+    """Chooses the next token and its place."""
 
     def __init__(self, value: nn.Module, task: Fill) -> None:
         self._value, self._layout, self._sim = value, task.layout, task.sim
@@ -45,17 +45,17 @@ class Filler:
         anything: Bools,
         generators: Sequence[np.random.Generator] = (),
     ) -> Choice:
-        """What to play.
+        """Choose a token, its side and its velocity for each environment.
 
         Args:
             corners: (B, V, 2) of the tokens.
-            placed: (B, K) which are placed.
+            placed: (B, K) whether each token is placed.
             goals: (B, G, 2) outlines to fill.
-            anything: (B,) where any place will do, drawn by the environment's generator.
-            generators: one for each environment, where some explore.
+            anything: (B,) where to draw a random next place by the environment's generator.
+            generators: one for each environment while exploring, else none.
 
         Raises:
-            ConfigError: goals of another form, as the corners of pieces are.
+            ConfigError: the goals have another form, such as corners of pieces.
         """
         count = len(corners)
         if goals.shape != (count, self._rows, 2):
@@ -76,7 +76,7 @@ class Filler:
         sides = self._layout.flipped(corners)
         for b, place in enumerate(best):
             laid = place.laid if place else None
-            if laid is None and not len(generators):  # nothing is learned from where it then lies
+            if laid is None and not len(generators):  # exploration does not need it
                 laid = self._rough(rests[b], corners[b], placed[b])
             token[b], wanted[b] = self._taken(laid, here[b], sides[b], placed[b])
             flip[b] = laid is not None and bool(sides[b, token[b]] != laid.flipped)
@@ -85,9 +85,9 @@ class Filler:
         return Choice(token, flip, velocity)
 
     def values(self, places: Sequence[Place]) -> Floats:
-        """How surely what is left can be filled, as logits; a filled one is surest.
+        """Logits that the rest after each place can be filled; infinity if it is filled already.
 
-        Minus infinity where there are more corners than are seen.
+        Minus infinity if the rest has more corners than the network takes.
         """
         found = np.full(len(places), np.inf)
         still = [i for i, place in enumerate(places) if not place.filled]
@@ -100,7 +100,7 @@ class Filler:
         return found
 
     def _best(self, every: Sequence[list[Place]]) -> list[Place | None]:
-        """Of each environment the place whose rest is most surely filled; the first of equals."""
+        """The place of the highest value in each environment; the first of equals."""
         values = self.values([one for places in every for one in places])
         own = np.split(values, np.cumsum([len(places) for places in every])[:-1])
         return [
@@ -111,7 +111,7 @@ class Filler:
     def _taken(
         self, laid: Laid | None, here: Floats, sides: Bools, placed: Bools
     ) -> tuple[int, Floats]:
-        """The token that goes to a place, and its pose there; without one any stays where it is."""
+        """The token for a place and its pose there; without a place a token stays where it is."""
         left = np.flatnonzero(~placed)
         if laid is None:
             token = int(left[0]) if len(left) else 0
@@ -125,7 +125,7 @@ class Filler:
         return min(alike, key=far), laid.pose
 
     def _rough(self, rest: Area, corners: Floats, placed: Bools) -> Laid | None:
-        """Where a token that is left covers most of what is left; None if it covers others."""
+        """Where a token that is left covers most of the rest; None if it would cover others."""
         sides, tried, laid = self._layout.flipped(corners), [], []
         for token in np.flatnonzero(~placed).tolist():
             for part in polygons(rest):

@@ -1,9 +1,10 @@
-"""Filling an outline token by token: what is left of it, what may be laid next, and what then is.
+"""Filling an outline token by token: its rest, the possible next places, and the next states.
 
-Nothing here is learned: tokens may lie where the search of `tangram_sim.geometry.dissections` has
-them, and an action takes one there exactly. What is learned is which of these states can be filled.
+Nothing here is learned. The search of `tangram_sim.geometry.dissections` finds the places, and an
+action takes a token there exactly. The network learns which of the next states can be filled. The
+rest of an outline is the part that no laid token covers.
 
-Legend: K tokens, V corners, G rows of an outline, N corners of what is left, S different shapes.
+Legend: K tokens, V corners, G rows of an outline, N corners of a rest, S different shapes.
 """
 
 from dataclasses import dataclass
@@ -19,24 +20,24 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines
 from tangram_sim.geometry.rings import as_area, covered_area
 
-TOLERANCE = 0.004  # of the root of all tokens' area, see `Search`
-MOST_PLACES = 8  # that are learned from, of a state
+TOLERANCE = 0.004  # share of the root of all tokens' area, see `Search`
+MOST_PLACES = 8  # places of a state that are learned from
 UNUSED = 255  # part of a row that holds no corner
 _INSIDE = 0.9  # share of a laid token that lies in the outline
 
 
 @dataclass(frozen=True, eq=False)
 class Rests:
-    """What is left to fill, of n states, as their corners see it.
+    """Network inputs of n states: the corners of their rests, and the tokens that are left.
 
-    In units of the root of all tokens' area, from the middle of what is left, its longest side
-    along the x axis: so a figure looks the same wherever it lies.
+    The unit is the root of all tokens' area. The origin is the middle of the rest, and its longest
+    side lies along the x axis. So a figure looks the same wherever it lies.
 
     Attributes:
         points: (n, N, 2) corners, ring after ring.
-        follow: (n, N) which corner is next on its ring.
-        part: (n, N) to which part it belongs, `UNUSED` where there is none.
-        left: (n, S) tokens that are left of each shape.
+        follow: (n, N) index of the next corner on the same ring.
+        part: (n, N) number of the corner's part of the rest; `UNUSED` without a corner.
+        left: (n, S) how many tokens of each shape are left.
     """
 
     points: Singles
@@ -49,12 +50,12 @@ class Rests:
 
     @property
     def known(self) -> Bools:
-        """(n,) states that have corners, and no more than are seen."""
+        """(n,) whether a state has corners, and at most N."""
         return np.asarray((self.part != UNUSED).any(axis=1))
 
     @staticmethod
     def empty(count: tuple[int, ...], corners: int, shapes: int) -> "Rests":
-        """States of no corners."""
+        """States without corners."""
         return Rests(
             np.zeros((*count, corners, 2), np.float32),
             np.tile(np.arange(corners, dtype=np.uint8), (*count, 1)),
@@ -64,14 +65,14 @@ class Rests:
 
     @staticmethod
     def joined(every: list["Rests"]) -> "Rests":
-        """States one after the other."""
+        """Concatenate groups of states."""
         columns = zip(*(vars(one).values() for one in every), strict=True)
         return Rests(*map(np.concatenate, columns))
 
     def turned(self, generator: np.random.Generator) -> "Rests":
-        """The same states, each turned by some eighths and half of them seen in a mirror.
+        """The states, each turned by random eighths of a circle, and half of them mirrored.
 
-        That changes nothing of what fills them where tokens may be turned over.
+        The same tokens still fill them if tokens may be turned over.
         """
         count = len(self)
         z = self.points @ np.array([1.0, 1.0j], np.complex64)
@@ -84,22 +85,22 @@ class Rests:
         return Rests(points, follow, self.part, self.left)
 
     def at(self, rows: Ints | Bools | slice) -> "Rests":
-        """Some of the states."""
+        """The states in the given rows."""
         return Rests(*(part[rows] for part in vars(self).values()))
 
     @property
     def flat(self) -> "Rests":
-        """Rows of states (n, M), one state after the other."""
+        """States (n, M) as n * M single states."""
         return Rests(*(part.reshape(-1, *part.shape[2:]) for part in vars(self).values()))
 
 
 class Filling:
-    """The game of one set of tokens.
+    """Rules for filling outlines with one set of tokens.
 
     Attributes:
-        tokens: K.
-        corners: N.
-        shapes: S.
+        tokens: K, number of tokens.
+        corners: N, most corners of a rest.
+        shapes: S, number of different shapes.
         shape_of: (K,) the number of each token's shape.
     """
 
@@ -114,18 +115,18 @@ class Filling:
         self.corners = layout.corner_count + layout.tokens
 
     def left(self, tokens: Bools) -> tuple[int, ...]:
-        """How many of each shape there are among tokens (K,)."""
+        """How many of the marked tokens (K,) have each shape."""
         return tuple(np.bincount(self.shape_of[tokens], minlength=self.shapes).tolist())
 
     def inside(self, corners: AnyArray, outline: AnyArray) -> Bools:
-        """(K,) tokens with corners (V, 2) that lie in an outline (G, 2), all but for a little."""
+        """(K,) whether tokens with corners (V, 2) lie in an outline (G, 2) by at least 90 %."""
         area = as_area(outline)
         own = outlines(np.asarray(corners, np.float64)[None], self._layout)[0]
         shared = shapely.area(shapely.intersection(shapely.polygons(own), area))
         return np.asarray(shared >= _INSIDE * self._layout.areas)
 
     def rest(self, outline: AnyArray, corners: AnyArray, laid: Bools) -> Area:
-        """What laid tokens (K,), with all tokens' corners (V, 2), leave of an outline (G, 2)."""
+        """The rest of an outline (G, 2) with laid tokens (K,), from all tokens' corners (V, 2)."""
         area = as_area(outline)
         if not laid.any():
             return area
@@ -133,11 +134,11 @@ class Filling:
         return without(area, covered, self._tolerance, self._tokens.unit)
 
     def hindsight(self, corners: AnyArray, tokens: Bools) -> Rests | None:
-        """What tokens (K,) came to cover, as something that they fill; None if they lie on others.
+        """The area that some tokens cover, as a state that they fill; None if they overlap.
 
         Args:
             corners: (V, 2) of all tokens.
-            tokens: some of them.
+            tokens: (K,) which tokens.
         """
         covered = covered_area(np.asarray(corners), self._layout, tokens)
         own, left = opened(covered, self._tolerance), self.left(tokens)
@@ -145,17 +146,17 @@ class Filling:
         return seen if self._search.fits(own, left) and bool(seen.known.all()) else None
 
     def solved(self, outline: AnyArray, corners: AnyArray, laid: Bools) -> bool:
-        """Whether laid tokens (K,), all of them, fill an outline (G, 2)."""
+        """Whether all tokens are laid (K,) and fill an outline (G, 2)."""
         if not laid.all():
             return False
         return self._search.fits(self.rest(outline, corners, laid), self.left(~laid))
 
     def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        """What may be laid next so that it can still be filled, see `Search.places`."""
+        """Next places after which the rest may still be filled, see `Search.places`."""
         return [place for place in self._search.places(rest, left) if not place.dead]
 
     def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
-        """One state; empty where it has too many corners."""
+        """Network input of one state; without corners if it has more than N."""
         found = Rests.empty((1,), self.corners, self.shapes)
         found.left[0] = left
         every = rings(rest, self._tolerance)

@@ -1,9 +1,8 @@
-"""What the agent of outlines learns from: states that it played, and those that hindsight fills.
+"""The replay buffer of the agent for outlines: played states, and states filled in hindsight.
 
-In its purest form hindsight needs no other goal: whatever tokens have come to cover is an outline
-that they fill, and so is what any of them cover; and where play filled the outline, so it did all
-states on the way. What went wrong teaches, too: of each state that was played the states are kept
-that it could have gone on to.
+Hindsight needs no new goal here: the area that tokens cover is an outline that they fill. The same
+holds for some of the tokens. If an episode filled its outline, all its states could be filled.
+Failures teach, too: each played state is kept with the states that could have followed.
 
 Legend: E episodes, T steps, n rows, M places, K tokens, N corners, S shapes.
 """
@@ -23,18 +22,19 @@ from tangram_core.spec import Array, Arrays, Episodes
 from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.layout import Layout
 
-OPEN, FILLED = 1, 2  # of a place; 0: there is none, or it is dead
+OPEN, FILLED = 1, 2  # kinds of places; 0: no place, or a dead one
 
 
 @dataclass(frozen=True, eq=False)
 class FillBatch:
-    """States to learn from.
+    """A batch of states.
 
     Attributes:
         filled: states (n,) that tokens filled.
         played: states (n',) that were played.
-        places: (n' * M) what each of them could have gone on to.
-        ends: (n', M) of these OPEN, FILLED, or 0; FILLED, too, where play went on and filled all.
+        places: states (n' * M) that could have followed each of them.
+        ends: (n', M) OPEN, FILLED or 0 for each of `places`. The first one is FILLED, too, if the
+            episode filled its outline.
     """
 
     filled: Rests
@@ -44,25 +44,25 @@ class FillBatch:
 
     @property
     def arrays(self) -> Arrays:
-        """All that it consists of, by name."""
+        """The arrays of the batch, by name."""
         states = _named("filled", self.filled) | _named("played", self.played)
         return states | _named("places", self.places) | {"ends": self.ends}
 
 
 class FillReplay:
-    """States that were played, with the places of each, and those of hindsight.
+    """Replay buffer of played states with their next places, and of hindsight states.
 
     Attributes:
-        capacity: states kept of each.
+        capacity: most states of each kind.
     """
 
     def __init__(self, layout: Layout, capacity: int, copies: int) -> None:
-        """Allocate everything at once.
+        """Allocate all arrays at once.
 
         Args:
             layout: the tokens.
-            capacity: states kept of each kind.
-            copies: states of hindsight for each episode.
+            capacity: most states of each kind.
+            copies: hindsight states for each episode.
         """
         self.capacity, self._copies = capacity, copies
         self._filling = Filling(layout)
@@ -72,7 +72,7 @@ class FillReplay:
         self._filled = Ring(self._room("filled"), "filled")
 
     def _room(self, name: str, *each: int) -> dict[str, Column]:
-        """For so many states in each row."""
+        """Empty columns, with one state in each row or a group of states."""
         corners = self._filling.corners
         empty = Rests.empty((self.capacity, *each), corners, self._filling.shapes)
         bounds = {f"{name}_follow": (0, corners - 1)}
@@ -82,17 +82,17 @@ class FillReplay:
         return min(len(self._played), len(self._filled))
 
     def insert(self, episodes: Episodes, generator: np.random.Generator) -> int:
-        """Take in episodes as they were played, and what their tokens came to cover.
+        """Add the played states of episodes and their hindsight states.
 
         Returns:
-            How many transitions there are in those that something is learned from.
+            The number of transitions in the episodes that were added.
         """
         used = 0
         for corners, placed, goal in zip(
             episodes["corners"], episodes["placed"], episodes["goals"], strict=True
         ):
-            # Corners are no worker's invention where it plays by the rules; where not, no geometry
-            # that a library trips over may end the run.
+            # A faulty worker may send impossible corners: an error of the geometry library must
+            # not end the run.
             with suppress(GEOSException):
                 if self._insert(corners, placed.astype(np.bool_), goal, generator):
                     used += len(corners) - 1
@@ -104,7 +104,7 @@ class FillReplay:
         """One episode: corners (T + 1, V, 2), placed (T + 1, K) and outlines (G, 2).
 
         Returns:
-            Whether it was taken: hindsight has a state of it.
+            Whether the episode was added: it must have a hindsight state.
         """
         filling, inside = self._filling, self._filling.inside(corners[-1], goal)
         own = np.flatnonzero(placed[-1] & inside)
@@ -115,14 +115,14 @@ class FillReplay:
         for step in range(len(corners) - 1):
             laid = placed[step]
             if (laid & ~inside).any():
-                break  # nothing fitted any more
+                break  # from here on no token fitted
             rest = filling.rest(goal, corners[step], laid)
             self._add_played(rest, filling.left(~laid), solved)
         self._filled.append(_named("filled", Rests.joined(filled)))
         return True
 
     def _hindsight(self, corners: Array, own: Ints, generator: np.random.Generator) -> list[Rests]:
-        """What some of their own tokens (n,) cover; nothing where they lie on each other."""
+        """States that random subsets of tokens (n,) fill; none for subsets that overlap."""
         filling, found = self._filling, list[Rests]()
         for _ in range(self._copies if len(own) else 0):
             chosen = np.zeros(filling.tokens, np.bool_)
@@ -141,7 +141,7 @@ class FillReplay:
         seen = [self._filling.seen(place.rest, place.left) for place in places[:MOST_PLACES]]
         for i, (place, one) in enumerate(zip(places, seen, strict=False)):
             ends[0, i] = FILLED if place.filled else OPEN * bool(one.known.all())
-        if solved and places:  # no matter by which place: a state is worth its best one
+        if solved and places:  # any place will do: only the best one counts
             ends[0, 0] = FILLED
         more = (MOST_PLACES - len(seen),)
         none = Rests.empty(more, self._filling.corners, self._filling.shapes)
@@ -150,10 +150,10 @@ class FillReplay:
         self._played.append(_named("played", state) | row | {"ends": ends})
 
     def sample(self, size: int, generator: np.random.Generator) -> FillBatch:
-        """`size` states, half of them of hindsight, drawn uniformly with replacement.
+        """`size` states, half of them from hindsight, drawn uniformly with replacement.
 
         Raises:
-            ValueError: there are none of one kind.
+            ValueError: the buffer has no states of one kind.
         """
         played = self._played.drawn(size - size // 2, generator)
         filled = self._filled.drawn(size // 2, generator)
@@ -169,12 +169,12 @@ class FillReplay:
         return self._played.state() | self._filled.state()
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state, see `Ring`."""
+        """Load a state, see `Ring.load_state`."""
         self._played.load_state(state)
         self._filled.load_state(state)
 
     def check_valid(self) -> None:
-        """Raise RunError unless every kept number is finite and every index within its bounds."""
+        """Raise RunError if a kept number is not finite or an index exceeds its bounds."""
         self._played.check_valid()
         self._filled.check_valid()
 

@@ -1,8 +1,8 @@
 """Learning which states can be filled: Q-learning over afterstates, with hindsight (Sec. III-B).
 
-Every action leads to a known state, so the value of an action is that of what is left. A state
-that tokens filled has the value 1. One that was played has that of the best it could have gone on
-to, by the target network: 1 where that is filled, 0 where nothing fits (Eq. 5, reward at the end).
+Every action leads to a known state, so its value is the value of that state. A state that tokens
+filled has the value 1. A played state has the value of the best state that could have followed, by
+the target network: 1 if that one is filled, 0 if no token fits (Eq. 5, reward at the end).
 
 Legend: n states, M places.
 """
@@ -25,7 +25,7 @@ from tangram_tasks.fill import Fill
 
 
 class FillLearner(TokenLearner):
-    """The value of what is left, its target and its optimiser."""
+    """Learner of the value of states, with a target network."""
 
     compiles = False
     replay: FillReplay
@@ -40,16 +40,16 @@ class FillLearner(TokenLearner):
         self.replay = FillReplay(task.layout, config.replay_capacity, config.copies)
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:
-        """Keep states that were played, and those that tokens came to fill."""
+        """Add played states and hindsight states to the replay buffer."""
         return self.replay.insert(learnable(episodes), rng["hindsight"])
 
     def drawn(self, rng: Streams) -> FillBatch:
-        """States of the replay."""
+        """Draw a batch of states from the replay buffer."""
         self.batch = drawn = self.replay.sample(self.config.batch_size, rng["replay"])
         return drawn
 
     def losses(self, seen: FillBatch) -> Iterator[Loss]:
-        """How surely states can be filled; q is the mean value of those that were played."""
+        """Yield the cross-entropy of the value; q is the mean value of played states."""
         y = torch.cat([torch.ones(len(seen.filled), device=self.place), self.values(seen)])
         states = Rests.joined([seen.filled, seen.played])
         logits = self.value(Corners.of(states, self.place))
@@ -58,7 +58,7 @@ class FillLearner(TokenLearner):
         yield Loss("critic", loss, {"q": q})
 
     def values(self, batch: FillBatch) -> Tensor:
-        """(n',) of states that were played, by what each could have gone on to."""
+        """Target values (n',) of played states, by the best state that could have followed."""
         best = self.tensor(batch.ends == FILLED)
         rows = np.flatnonzero(batch.ends.ravel() == OPEN)
         if len(rows):

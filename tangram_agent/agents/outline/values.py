@@ -1,6 +1,6 @@
-"""What is left to fill -> whether it can be filled: attention over the corners of an outline.
+"""The value network for outlines: attention over the corners of the rest.
 
-The paper's outlook: "outline corners as nodes". Every corner sees every other one of what is left.
+The paper's outlook names "outline corners as nodes". Every corner of the rest sees all others.
 Legend: n states, N corners, F features, W width, S different shapes.
 """
 
@@ -29,7 +29,7 @@ class Corners(NamedTuple):
 
     @staticmethod
     def of(rests: Rests, device: torch.device | None = None) -> "Corners":
-        """On a device, without the rows that no state uses: these would cost the most."""
+        """The states as tensors on a device, cut to the corners in use to save time."""
         most = max(1, int((rests.part != UNUSED).sum(axis=1).max(initial=0)))
         columns = (part[:, :most] for part in (rests.points, rests.follow, rests.part))
         points, follow, part = (torch.from_numpy(np.ascontiguousarray(one)) for one in columns)
@@ -40,7 +40,7 @@ class Corners(NamedTuple):
 
 
 class OutlineValue(nn.Module):
-    """The logit of the probability that the tokens left can fill what is left."""
+    """Network for the logit of the probability that the tokens left can fill the rest."""
 
     def __init__(self, shapes: int, net: NetConfig) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ class OutlineValue(nn.Module):
         )
 
     def forward(self, corners: Corners) -> Tensor:
-        """(n,) logits, the same for every state without corners."""
+        """Logits (n,), equal for all states without corners."""
         untraced()
         used = corners.part != UNUSED
         edges = used[:, None, :] & used[:, :, None]
@@ -63,7 +63,7 @@ class OutlineValue(nn.Module):
 
 
 def features(corners: Corners) -> Tensor:
-    """(n, N, F): where each corner is, its sides, its angle, its part, and the tokens left."""
+    """Features (n, N, F): position, sides, angle and part of each corner, and the tokens left."""
     points, follow, part, left = corners
     count, most = follow.shape
     follow = follow.clamp(max=most - 1)
@@ -97,5 +97,5 @@ def features(corners: Corners) -> Tensor:
 
 
 def taken(points: Tensor, index: Tensor) -> Tensor:
-    """(n, N, 2) the points of rows (n, N), as `Corners.follow` names them."""
+    """Points (n, N, 2) at indices (n, N), such as `Corners.follow`."""
     return points.gather(1, index[..., None].expand(-1, -1, points.shape[-1]))

@@ -1,5 +1,5 @@
 """The agent that sees pairs of one token and one piece of the target.
 
-Start with `pairs.py`: the graph of a pair. `planning.py` chooses among pairs, `covered.py` says
-what tokens cover there, `coverage.py` in what is learned from.
+Start with `pairs.py`: the graph of a pair. `planning.py` chooses among pairs. `covered.py` computes
+what tokens cover while playing, `coverage.py` while learning.
 """

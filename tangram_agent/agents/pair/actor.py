@@ -1,4 +1,4 @@
-"""Acting on pairs: the best of what is proposed for each of them.
+"""The actor for pairs: it plays the best of the proposals for all pairs.
 
 Legend: B environments, K tokens, A entries of an action.
 """
@@ -23,14 +23,14 @@ from tangram_tasks.played import closed
 
 
 class Decision(nn.Module):
-    """Actions (B, A) of the task's fields, by name, exploration off."""
+    """Network from the task's fields, by name, to actions (B, A) without exploration."""
 
     def __init__(self, task: Place, planner: Planner) -> None:
         super().__init__()
         self._task, self.planner = task, planner
 
     def forward(self, seen: Mapping[str, Tensor]) -> Tensor:
-        """Of fields (B, ...), as `Place.spec` names them."""
+        """Actions (B, A) for fields (B, ...) with the names of `Place.spec`."""
         corners, goals = seen["corners"].double(), seen["goals"].double()
         token, flip, velocity = self.planner(corners, closed(seen), goals)
         return as_actions(token, flip, velocity, self._task)
@@ -47,11 +47,11 @@ class PairActor(NetworkActor):
         self._decides = Decision(task, Planner(networks, task, config.reapply))
 
     def needs(self, name: str) -> bool:
-        """Not the critic, where there is one proposal and nothing to choose."""
+        """Whether a parameter is needed to act; those of the critic only if `critic_plays`."""
         return self._critic_plays or not name.startswith("critic.")
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
-        """Actions (B, A), noisy or anything at all where it explores."""
+        """Actions (B, A); while exploring, with noise or drawn at random."""
         if not len(seen["corners"]):
             return np.zeros((0, self._task.spec.action_size), np.float32)
         corners, goals = (np.array(seen[name], np.float64) for name in ("corners", "goals"))
@@ -71,16 +71,16 @@ class PairActor(NetworkActor):
         return np.clip(actions, -1.0, 1.0)
 
     def graph(self) -> "Decision":
-        """The planner is one network."""
+        """The planner, as one network."""
         return self._decides
 
     def _anything(self, here: Floats, flags: Array, generator: np.random.Generator) -> Singles:
-        """An action (A,): any token that is left goes to any pose in the arena, on any side.
+        """A random action (A,): any token that is left, to any pose in the arena, on any side.
 
         Args:
             here: (K, 3) poses of the tokens.
-            flags: (K,) which are placed; where all are, the first one is named.
-            generator: draws it.
+            flags: (K,) whether each token is placed; if all are, the first one moves.
+            generator: draws the action.
         """
         sim = self._task.sim
         left = np.flatnonzero(~flags)
@@ -95,8 +95,8 @@ class PairActor(NetworkActor):
 
 
 def critic_plays(task: Place) -> bool:
-    """Whether the critic has a say in what is played; else the actor alone decides.
+    """Whether the critic takes part in acting; otherwise the actor decides alone.
 
-    Of one token that stays on its side there is one proposal, and nothing to choose.
+    For one token that cannot be turned over there is one proposal, so there is no choice.
     """
     return task.layout.tokens > 1 or task.sim.allow_flip

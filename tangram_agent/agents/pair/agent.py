@@ -17,23 +17,23 @@ if TYPE_CHECKING:  # need torch
 
 @dataclass(frozen=True)
 class PairConfig(ActorCriticConfig, section="agent"):
-    """DDPG on pairs of a token and a piece of the target."""
+    """Settings of DDPG on pairs of a token and a piece of the target."""
 
     reapply: int = setting(
-        2, "times that the actor is applied again to what it proposed", low=0, high=100
+        2, "times that the actor is applied again to its own proposal", low=0, high=100
     )
 
 
 @dataclass(frozen=True)
 class Pair(TokenAgent):
-    """Learns the angle, too, and any number of tokens with one network."""
+    """The agent of pairs: one network for any number of tokens, which learns angles, too."""
 
     sections: ClassVar = {"agent": PairConfig, "net": NetConfig}
 
     config: PairConfig
 
     def check(self, task: Task) -> None:
-        """It plays tokens whose target is seen; what several of them cannot use is refused."""
+        """Refuse tasks that hide the pieces, and settings that several tokens cannot use."""
         place = seen_tokens(task, "pair")
         super().check(task)
         if place.layout.tokens > 1:
@@ -58,7 +58,7 @@ class Pair(TokenAgent):
         return PairActor(cast("Place", task), self.config, self.net)
 
     def learns(self) -> "type[PairLearner]":
-        """With actor and critic."""
+        """The learner's class."""
         from tangram_agent.agents.pair.learner import PairLearner  # noqa: PLC0415
 
         return PairLearner

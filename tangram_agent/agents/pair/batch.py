@@ -1,4 +1,4 @@
-"""Transitions as pairs of a token and a piece of the target, with the goals of hindsight.
+"""Transitions as pairs of a token and a piece of the target, with hindsight goals.
 
 Legend: M pairs, K tokens, V corners.
 """
@@ -15,7 +15,7 @@ from tangram_core.arrays import Floats, Ints, Singles
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens
 
-_PAIRS = 8  # of a transition of several tokens in one update
+_PAIRS = 8  # pairs that a transition of several tokens gives in an update
 _CORRECTED = 0.25  # share of pairs that begin where the action ended
 _OTHER_SHAPE = 0.15  # share of hindsight pieces that have any shape, not the token's
 _OTHER_SIDE = 0.1  # share of hindsight pieces on the other side than the token
@@ -24,18 +24,18 @@ _COVERED = 0.3  # share of hindsight pieces that are covered in part already
 
 @dataclass(frozen=True, eq=False)
 class PairBatch:
-    """M pairs as they were before and after an action, and what that is worth.
+    """M pairs before and after an action, and the value of the action.
 
     Attributes:
-        before, after: the token that moved.
-        start: where the actor is asked from: mostly before, else where it came to, to mend what it
-            proposed itself: nobody plays that, as starts are far from targets.
+        before, after: the moved token before and after the action.
+        start: the token for which the actor proposes a velocity, mostly as before the action. A
+            share is as after it: so the actor learns to correct its own proposals.
         velocity: (M, 3) of the action.
-        piece: of the target.
+        piece: the piece of the target.
         covered: (M,) share of the piece that was covered before the action.
-        reward: (M,) what the action is worth: with several tokens what the token covers newly of
-            the piece, over the larger of both areas; with one the environment's reward.
-        done: (M,) 1 where nothing follows.
+        reward: (M,) value of the action: with one token the environment's reward; with several the
+            newly covered area of the piece, over the larger area of token and piece.
+        done: (M,) 1 where the target does not count the next state.
     """
 
     before: Lying
@@ -56,10 +56,9 @@ def make_pairs(
 ) -> PairBatch:
     """Pairs of a batch of transitions.
 
-    One token and its piece are the whole scene: each transition is a pair, with the goal that it
-    has in the replay and the environment's reward for that. With several tokens each transition
-    gives `_PAIRS`, of the token that moved and any piece, a share of them with the
-    goals that were played, the rest with those of hindsight: as many parts as there are copies.
+    With one token each transition is one pair, with its goal and reward in the replay buffer. With
+    several tokens each transition gives `_PAIRS` pairs of the moved token and a random piece. One
+    part of the pairs has the played goals. Each kind of hindsight has as many parts as copies.
     """
     several = layout.tokens > 1
     each = _PAIRS if several else 1
@@ -71,7 +70,7 @@ def make_pairs(
         # One part for the goals that were played, then as many for each kind as it has copies.
         parts = np.array([1, *(relabel.copies for relabel in hindsight)])
         strategy = generator.choice(len(parts), size=len(rows), p=parts / parts.sum())
-        # Any piece of the goals that were played, and what others covered of it before.
+        # A random piece of the played goals, and the share that other tokens covered before.
         piece = lying(batch.goal, layout, rows, generator.integers(layout.tokens, size=len(rows)))
         table = covered_share(covering(batch.state, batch.goal, layout), layout)
         covered = table[rows, token, piece.index]
@@ -79,7 +78,8 @@ def make_pairs(
         reward, done = newly_covered(after, piece, covered, layout), np.ones(len(rows), np.uint8)
     else:
         piece, covered = lying(batch.goal, layout, rows, token), np.zeros(len(rows))
-        # Most goals are where the token came to lie: else it would know them by its own turn.
+        # Most hindsight goals are the token's own pose: without a random symmetric turn the actor
+        # would know them by their angle.
         piece.pose[:, 2] += _alike(piece.index, layout, generator)
         reward, done = batch.reward.astype(np.float64), batch.done
     start = after.instead(before, generator.random(len(rows)) >= _CORRECTED)
@@ -88,7 +88,7 @@ def make_pairs(
 
 
 def _alike(piece: Ints, layout: Layout, generator: np.random.Generator) -> Floats:
-    """(M,) any of the turns by which pieces (M,) look the same."""
+    """Random turns (M,) after which pieces (M,) look the same."""
     order = np.array([shape.symmetry for shape in layout.shapes])[piece]
     turn: Floats = 2.0 * np.pi / order * generator.integers(order)
     return turn
@@ -103,10 +103,10 @@ def _relabel(
     layout: Layout,
     generator: np.random.Generator,
 ) -> None:
-    """Put hindsight in the place of pieces (M,): where the token came to lie, or near.
+    """Replace pieces (M,) by hindsight pieces at the token's new pose, or near it.
 
-    Strategy i, (M,), is its i-th kind; 0 keeps the piece. Mostly it becomes one of the token's own
-    shape and side, of which nothing is covered.
+    Strategy (M,) is the number of the kind of hindsight; 0 keeps the piece. Most new pieces have
+    the token's shape and side, and nothing of them is covered.
     """
     hind = np.flatnonzero(strategy)
     size, token = len(hind), after.index[hind]

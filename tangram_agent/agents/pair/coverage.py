@@ -1,4 +1,4 @@
-"""What tokens cover of a target's pieces: the exact geometry that critics for several tokens learn.
+"""Areas of a target's pieces that tokens cover: the exact values that the pair critic learns.
 
 Legend: B scenes, M single pieces, K tokens, V corners of all tokens, C of the largest.
 """
@@ -17,11 +17,11 @@ Corners = npt.NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class Lying:
-    """M single tokens, or pieces of targets, as they lie.
+    """Poses of M single tokens, or of M pieces of targets.
 
     Attributes:
-        index: (M,) which of the layout's tokens.
-        pose: (M, 3).
+        index: (M,) index in the layout's tokens.
+        pose: (M, 3) x, y and angle.
         flipped: (M,) whether it lies on its other side.
     """
 
@@ -30,7 +30,7 @@ class Lying:
     flipped: Bools
 
     def instead(self, others: "Lying", where: Bools) -> "Lying":
-        """Others in the place of those where (M,) that is said, index for index the same."""
+        """A copy with the poses of others where (M,) is true; both have the same `index`."""
         pose = np.where(where[:, None], others.pose, self.pose)
         return Lying(self.index, pose, np.where(where, others.flipped, self.flipped))
 
@@ -41,26 +41,26 @@ class Lying:
 
 
 def lying(corners: Corners, layout: Layout, rows: Ints, index: Ints) -> Lying:
-    """One token (M,) of each of the scenes (M,) among corners (B, V, 2)."""
+    """The token index (M,) in the scene rows (M,), for M pairs of both; corners are (B, V, 2)."""
     exact = np.asarray(corners, np.float64)
     return Lying(index, layout.poses(exact)[rows, index], layout.flipped(exact)[rows, index])
 
 
 def covering(corners: Corners, goals: Corners, layout: Layout) -> Floats:
-    """(B, K, K) area of piece j that token i covers where it lies, placed or not.
+    """Areas (B, K, K) of piece j that token i covers, whether the token is placed or not.
 
     Args:
-        corners: (B, V, 2) of the tokens; from pictures, of the pieces that fit them best.
+        corners: (B, V, 2) of the tokens; exact tokens are fitted to corners from pictures.
         goals: (B, V, 2) of the targets.
-        layout: of both.
+        layout: layout of both.
     """
     return shared_areas(_fitted(corners, layout), _fitted(goals, layout))
 
 
 def covered_share(covered: Floats, layout: Layout) -> Floats:
-    """(B, K, K) share of piece j that tokens other than i cover, by what `covering` gave.
+    """Shares (B, K, K) of piece j that tokens other than i cover, from the areas of `covering`.
 
-    So a token that is to move is seen as if it were gone.
+    So the token that moves does not count.
     """
     others = covered.sum(axis=1, keepdims=True) - covered
     share: Floats = np.clip(others / layout.areas, 0.0, 1.0)
@@ -68,17 +68,16 @@ def covered_share(covered: Floats, layout: Layout) -> Floats:
 
 
 def newly_covered(token: Lying, piece: Lying, covered: Floats, layout: Layout) -> Floats:
-    """(M,) the area of a piece that a token covers and nothing covered before, as a value.
+    """Values (M,) of tokens on pieces: the newly covered area over the larger area of the two.
 
-    Over the larger of both areas: over the token's own a small one inside of a large piece would
-    be worth as much as the right one. Where a piece is covered in part, what the token covers is
-    taken to be what is left first.
+    Over the token's own area a small token in a large piece would have the same value as the right
+    token. In a partly covered piece the token is assumed to cover the free part first.
 
     Args:
         token: M tokens.
-        piece: the piece of the target for each.
-        covered: (M,) share of it that is covered already, in [0, 1].
-        layout: of both.
+        piece: a piece of the target for each token.
+        covered: (M,) share of the piece that is covered already, in [0, 1].
+        layout: layout of both.
     """
     own, wanted = layout.areas[token.index], layout.areas[piece.index]
     shared = shared_area(piece.outlines(layout), token.outlines(layout))
@@ -87,6 +86,6 @@ def newly_covered(token: Lying, piece: Lying, covered: Floats, layout: Layout) -
 
 
 def _fitted(corners: Corners, layout: Layout) -> Floats:
-    """Outlines (B, K, C, 2) of the exact pieces that fit corners (B, V, 2) best."""
+    """Outlines (B, K, C, 2) of the exact tokens that fit corners (B, V, 2) best."""
     seen = np.asarray(corners, np.float64)
     return outlines(layout.corners(layout.poses(seen), layout.flipped(seen)), layout)

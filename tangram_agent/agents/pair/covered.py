@@ -1,7 +1,7 @@
-"""What tokens cover of a target's pieces, in tensors of fixed shapes, for the network that plays.
+"""Areas of a target's pieces that tokens cover, as tensors of fixed shapes, for acting.
 
-The same as `coverage.py` has it for what is learned from. Legend: B scenes, K tokens, V corners of
-all tokens, C of the largest, S sides of a polygon that was clipped.
+`coverage.py` computes the same for learning. Legend: B scenes, K tokens, V corners of all tokens,
+C of the largest, S sides of a polygon that was clipped.
 """
 
 import torch
@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from tangram_agent.nets.graph import turn
 from tangram_sim.geometry.layout import Layout
 
-Lie = tuple[Tensor, Tensor, Tensor]  # what `Covered.forward` gives
+Lie = tuple[Tensor, Tensor, Tensor]  # result of `Covered.forward`
 
 
 class Covered(nn.Module):
-    """How tokens lie, and what they cover, of their corners."""
+    """Computes the poses of tokens from their corners, and the areas that they cover."""
 
     owner: Tensor
     weights: Tensor
@@ -40,7 +40,7 @@ class Covered(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def forward(self, corners: Tensor) -> Lie:
-        """Where tokens with corners (B, V, 2) lie, as `Layout.poses` and `Layout.flipped` say it.
+        """Poses of tokens with corners (B, V, 2), as in `Layout.poses` and `Layout.flipped`.
 
         Returns:
             Their centres (B, K, 2), their angles (B, K, 2) as cosine and sine, and (B, K) 1 where
@@ -61,19 +61,19 @@ class Covered(nn.Module):
         return torch.stack([one @ self.owner for one in products], dim=-1)
 
     def outlines(self, centres: Tensor, turns: Tensor, flipped: Tensor) -> Tensor:
-        """(B, K, C, 2) counter-clockwise corners, of what `forward` gives."""
+        """Counter-clockwise corners (B, K, C, 2), from the result of `forward`."""
         other = self.padded.flip(1) * self.padded.new_tensor([1.0, -1.0])
         body = torch.where(flipped[..., None, None] > 0, other, self.padded)
         return centres[..., None, :] + turn(body, turns[..., None, :])
 
     def shares(self, tokens: Lie, pieces: Lie) -> tuple[Tensor, Tensor]:
-        """What tokens cover of pieces, of how both lie; nothing, where there is one of each.
+        """Shares of pieces that tokens cover, from the poses of both; zeros for a single token.
 
-        A single token gives up nothing and finds nothing covered, so nobody asks what it covers.
+        With a single token there is no choice, so its shares are not needed.
 
         Returns:
-            (B, K, K) share of the second, a piece, that tokens other than the first cover, and (B,
-            K) the worth of what each token covers.
+            (B, K, K) share of piece j that tokens other than i cover, and (B, K) the summed value
+            of the areas that each token covers.
         """
         shared = pieces[2][:, :, None] * 0.0
         if self.areas.shape[0] > 1:
@@ -84,10 +84,10 @@ class Covered(nn.Module):
 
 
 def shared_areas(first: Tensor, second: Tensor) -> Tensor:
-    """(B, K, L) areas that convex polygons (B, K, C, 2) and others (B, L, C, 2) share.
+    """Common areas (B, K, L) of convex polygons (B, K, C, 2) and others (B, L, C, 2).
 
-    Sutherland and Hodgman's clipping of sides, whose number grows by two with each line: what is
-    outside becomes a side without length, and two join where the line was crossed.
+    Clips sides after Sutherland and Hodgman. A side outside of a line loses its length. Each line
+    adds two sides, which join the points where it was crossed.
     """
     begins, ends = first[:, :, None], first.roll(-1, 2)[:, :, None]
     for c in range(second.shape[2]):
@@ -114,5 +114,5 @@ def shared_areas(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
-    """(...) of vectors (..., 2)."""
+    """Cross products (...) of vectors (..., 2)."""
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]

@@ -1,7 +1,7 @@
 """Learning on pairs of a token and a piece of the target.
 
-With several tokens what an action is worth falls apart into what it covers of each piece, and
-hindsight knows the geometry: so a pair's value is known at once, and nothing is bootstrapped.
+With several tokens the value of an action is the sum of what it covers of each piece. The geometry
+gives these values for any goal at once, so nothing is bootstrapped.
 
 Legend: M pairs.
 """
@@ -21,7 +21,7 @@ from tangram_tasks.place import Place
 
 
 class PairLearner(Ddpg):
-    """Actor and critic."""
+    """DDPG learner of the actor and the critic of pairs."""
 
     limit = 1.0  # pre-activations beyond it are clamped
 
@@ -31,15 +31,15 @@ class PairLearner(Ddpg):
         networks = Networks(task.layout, task.sim.arena, agent.net)
         every = networks.actor, networks.critic, networks
         super().__init__(task, agent.config, every, seed, device, compiled)
-        if task.layout.tokens > 1:  # relabelled anew for every update
+        if task.layout.tokens > 1:  # each update draws new hindsight goals
             self.relabels = ()
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:
-        """Pairs of a batch."""
+        """The batch as pairs, with new hindsight goals for several tokens."""
         return self.steps_of(make_pairs(batch, self.task.layout, self.config.hindsight, generator))
 
     def steps_of(self, batch: PairBatch) -> Steps:
-        """Pairs as tensors."""
+        """The pairs as tensors for the losses."""
         after = self._pairs(batch, batch.after)
         return Steps(
             view=self._pairs(batch, batch.before),
@@ -52,7 +52,7 @@ class PairLearner(Ddpg):
         )
 
     def _pairs(self, batch: PairBatch, token: Lying) -> Pairs:
-        """The pairs (M,) with their tokens where they lay at some time."""
+        """The pairs (M,) with their tokens at the given poses."""
         piece = batch.piece
         return Pairs(
             pose=self.tensor(token.pose),
@@ -65,7 +65,7 @@ class PairLearner(Ddpg):
         )
 
     def broadcast(self) -> Tensors:
-        """Not the critic, where it has no say in what is played."""
+        """The averaged weights, without the critic if it takes no part in acting."""
         every = self.export()
         if critic_plays(self.task):
             return every

@@ -15,11 +15,11 @@ from tangram_sim.geometry.layout import Layout
 
 
 class ActorNet(nn.Module):
-    """pi(s, g): which velocity takes the token onto the piece.
+    """pi(s, g): the velocity that takes the token onto the piece.
 
-    The shift is clamped, and two outputs give the turn by their angle over the token's symmetry k:
-    it needs no more than 1/k of a half turn either way, and has no seam where two equally good
-    turns meet.
+    The shift is clamped. The angle of two outputs, divided by the token's symmetry k, is the turn.
+    So it is at most 1/k of a half turn either way, and does not jump where two equally good turns
+    meet.
     """
 
     def __init__(self, graph: PairGraph, net: NetConfig) -> None:
@@ -30,7 +30,7 @@ class ActorNet(nn.Module):
     def forward(self, pairs: Pairs, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Velocity (M, 3) in [-1, 1] in the arena's axes, and (M, 2) the shift before its clamp.
 
-        Features are as for `Head`.
+        `features` are as in `Head.forward`.
         """
         raw = self.head(pairs, features=features)
         angle = torch.atan2(raw[:, 3], raw[:, 2]) / self.graph.symmetry[pairs.token] / math.pi
@@ -38,7 +38,7 @@ class ActorNet(nn.Module):
 
 
 class CriticNet(nn.Module):
-    """Q(s, g, a): what a velocity is worth, by the pair as it would leave it: the afterstate."""
+    """Q(s, g, a): the value of a velocity, from the pair after the motion (the afterstate)."""
 
     def __init__(self, graph: PairGraph, net: NetConfig) -> None:
         super().__init__()
@@ -55,9 +55,9 @@ class CriticNet(nn.Module):
         """Values (M,).
 
         Args:
-            pairs: what the token is moved in.
+            pairs: the pairs before the motion.
             velocity: (M, 3) in the arena's axes.
-            after: what it came to, where that is known better than by the exact motion.
+            after: the observed pairs after the motion; None: computed by the exact motion.
         """
         seen = self.graph.moved(pairs, velocity) if after is None else after
         value: Tensor = self.head(seen).squeeze(-1)
@@ -65,7 +65,7 @@ class CriticNet(nn.Module):
 
 
 class Networks(nn.Module):
-    """All that plays: the critic chooses among what the actor proposes."""
+    """Actor and critic, as they act: the critic chooses among the actor's proposals."""
 
     def __init__(self, layout: Layout, arena: float, net: NetConfig) -> None:
         super().__init__()

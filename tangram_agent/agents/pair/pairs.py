@@ -10,10 +10,10 @@ from tangram_agent.nets.graph import turn, turn_back, unit
 from tangram_sim.geometry.fitting import KINDS, kind_of
 from tangram_sim.geometry.layout import Layout
 
-# Every tan has a number of its own, whatever set it is in; other shapes share the last one.
+# Every tangram shape has the same number in all sets; other shapes share the last number.
 _KINDS = len(KINDS) + 1
-_ANGLES = 5  # numbers that tell a piece's angle
-# Corners in radii are larger than the rest; then a perceptron's inputs are of about one size.
+_ANGLES = 5  # features of a piece's angle
+# Corners in units of radii are large: scaled, all inputs of a perceptron have about one size.
 _CORNER_SCALE = 0.3
 
 
@@ -21,16 +21,16 @@ _CORNER_SCALE = 0.3
 class Pairs:
     """M pairs of one token and one piece of the target.
 
-    A pair is seen from its token: relative to its centre, in its own orientation and, where it lies
-    on its other side, through a mirror. So one network knows every token, target and side.
+    Networks see a pair from its token: relative to its centre, in its orientation, and mirrored
+    where the token lies on its other side. So one network serves all tokens, targets and sides.
 
     Attributes:
         pose: (M, 3) x, y and angle of the token.
-        flipped: (M,) 1 where it lies on its other side.
-        token: (M,) its index.
+        flipped: (M,) 1 where the token lies on its other side.
+        token: (M,) index of the token.
         goal: (M, 3) pose of the target's piece.
-        goal_flipped: (M,) 1 where that lies on its other side.
-        piece: (M,) its index.
+        goal_flipped: (M,) 1 where the piece lies on its other side.
+        piece: (M,) index of the piece.
         covered: (M,) share of the piece that other tokens cover already.
     """
 
@@ -43,16 +43,16 @@ class Pairs:
     covered: Tensor
 
     def at(self, pose: Tensor) -> "Pairs":
-        """The same pairs with their tokens elsewhere."""
+        """The same pairs with their tokens at other poses (M, 3)."""
         return replace(self, pose=pose)
 
 
 class PairGraph(nn.Module):
     """The graph of a pair: the token's corners, its base, the target piece's corners.
 
-    The edges are those of Sec. IV-A. Shapes of fewer corners repeat their last one. Coordinates are
-    relative to the token, in its own orientation. Every node also knows its displacement from its
-    centre, the angle, both shapes and what of the piece is covered.
+    The edges are those of Sec. IV-A. Shapes with fewer corners repeat their last one. Coordinates
+    are relative to the token, in its orientation. Every node also has its displacement from its
+    centre, the angle, both shapes and the covered share of the piece.
     """
 
     tokens = 1  # in view
@@ -93,29 +93,29 @@ class PairGraph(nn.Module):
         return torch.full_like(pairs.token, self.corners)
 
     def relation(self, pairs: Pairs) -> tuple[Tensor, Tensor, Tensor]:
-        """The piece as its token sees it.
+        """The pose of the piece relative to its token.
 
         Returns:
-            (M, 2) where its centre is, (M,) its angle, and (M,) 1 where it lies on the other side
-            than the token.
+            (M, 2) the piece's centre, (M,) its angle, and (M,) 1 where token and piece lie on
+            different sides.
         """
-        # Through the mirror y and angles change their sign.
+        # A mirror changes the sign of y and of angles.
         sign = _signs(pairs.flipped)
         shift = turn_back(pairs.goal[:, :2] - pairs.pose[:, :2], unit(pairs.pose[:, 2]))
         place, angle = _mirrored(shift, sign), sign * (pairs.goal[:, 2] - pairs.pose[:, 2])
-        # A shape that is its own mirror image is, through the mirror, turned by a known angle.
+        # A mirror turns a shape that is its own mirror image by a known angle.
         chiral = self.chiral[pairs.piece]
         angle = angle + pairs.flipped * (1.0 - chiral) * self.mirror[pairs.piece]
         return place, angle, chiral * (pairs.flipped - pairs.goal_flipped).abs()
 
     def velocity(self, pairs: Pairs, shift: Tensor, angle: Tensor) -> Tensor:
-        """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
+        """Velocities (M, 3) from shifts (M, 2) in the token's frame and turns (M,) over pi."""
         sign = _signs(pairs.flipped)
         shift = turn(_mirrored(shift, sign), unit(pairs.pose[:, 2]))
         return torch.cat([shift, (sign * angle)[:, None]], dim=-1).clamp(-1.0, 1.0)
 
     def moved(self, pairs: Pairs, velocity: Tensor) -> Pairs:
-        """The pairs after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
+        """The pairs after the exact rigid motion by velocities (M, 3), as in the simulation."""
         return pairs.at(pairs.pose + velocity * self.full_scale)
 
     def way(self, pairs: Pairs, to: Tensor) -> Tensor:
@@ -125,7 +125,7 @@ class PairGraph(nn.Module):
         return torch.cat([way[:, :2], turned], dim=-1) / self.full_scale
 
     def vectors(self, pairs: Pairs) -> Tensor:
-        """(M, inputs): a pair in one row, without nodes."""
+        """Inputs (M, inputs) of a perceptron: each pair in one row."""
         place, angle, other_side = self.relation(pairs)
         radius = self.radius[pairs.token][:, None, None]
         own, offset = self._bodies(pairs, angle, other_side)
@@ -142,7 +142,7 @@ class PairGraph(nn.Module):
         return torch.cat(parts, dim=-1)
 
     def node_features(self, pairs: Pairs) -> Tensor:
-        """(M, N, F): corners of the token, its base, corners of the piece."""
+        """Node features (M, N, F): corners of the token, its base, corners of the piece."""
         place, angle, other_side = self.relation(pairs)
         own, offset = self._bodies(pairs, angle, other_side)
         base = torch.zeros_like(own[:, :1])
@@ -165,15 +165,15 @@ class PairGraph(nn.Module):
         return self.body[pairs.token], turn(body, unit(angle)[:, None])
 
     def _sizes(self, pairs: Pairs, place: Tensor) -> tuple[Tensor, Tensor]:
-        """(M,) how much larger the piece is, and (M,) how near, 1 where both centres are one."""
+        """(M,) log ratio of the areas of piece and token, and (M,) nearness, 1 at equal centres."""
         ratio = self.area[pairs.piece] / self.area[pairs.token]
         return ratio.log(), torch.exp(-place.norm(dim=-1) / self.radius[pairs.token])
 
     def _angles(self, pairs: Pairs, angle: Tensor) -> Tensor:
-        """(M, 5): cosine and sine of the angle, and of it times the piece's symmetry; how aligned.
+        """Features (M, 5): cosine and sine of angle times symmetry, those of the angle; alignment.
 
-        The reward has a cusp where both are aligned. Of smooth features the critic's maximum comes
-        to lie beside it: trained agents were up to 0.14 degrees off.
+        The reward has a cusp where both are aligned. With smooth features alone the critic has its
+        maximum beside the cusp: trained agents were up to 0.14 degrees off.
         """
         symmetry = self.symmetry[pairs.piece]
         folded = unit(angle * symmetry)

@@ -1,8 +1,8 @@
-"""Choosing among proposals: a pose for every pair of a token and a piece, and the best one played.
+"""The planner: the actor proposes a pose for every pair, and the best proposal is played.
 
-The critic values each proposal for its own piece; the best few are then valued for all pieces of
-the target, as an action is worth the sum of what it covers. All of it is one network of fixed
-shapes, so that tangram-export can write it down.
+The critic values each proposal for its own piece. The best few are then valued for all pieces of
+the target, because the value of an action is the sum of what it covers. The planner is one network
+of fixed shapes, so that tangram-export can export it.
 
 Legend: B environments, K tokens, V corners, N candidates of an environment (token, side and piece),
 M = B * N pairs, row after row.
@@ -21,22 +21,22 @@ from tangram_agent.nets.networks import untraced
 from tangram_tasks.place import Place
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
-# Of two that cover as much, the one that fills its own piece: a large triangle on three small
-# pieces is worth as much as one on its own, and leaves what nothing fits.
+# Weight of the value for the proposal's own piece, to decide between equal sums: a large triangle
+# on three small pieces covers as much as on its own piece, but leaves a rest that nothing fits.
 _OWN = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """B environments; sides are 1 where a token lies on its other one.
+    """Poses and coverage in B environments; a side is 1 where a token lies on its other side.
 
     Attributes:
         pose: (B, K, 3) of the tokens.
         flipped: (B, K) their sides.
         goal: (B, K, 3) of the target's pieces.
         goal_flipped: (B, K) their sides.
-        covered: (B, K, K) share of the second, a piece, that tokens other than the first cover.
-        worth: (B, K) sum of the values of what each token covers.
+        covered: (B, K, K) share of piece j that tokens other than i cover.
+        worth: (B, K) summed value of the areas that each token covers.
     """
 
     pose: Tensor
@@ -71,15 +71,15 @@ class Planner(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def forward(self, corners: Tensor, placed: Tensor, goals: Tensor) -> tuple[Tensor, ...]:
-        """What to play; where all tokens are placed, some action of the first one.
+        """Choose token, side and velocity; if all tokens are placed, an action of the first one.
 
         Args:
-            corners: (B, V, 2) of the tokens, in double precision as goals are.
+            corners: (B, V, 2) of the tokens, in double precision like `goals`.
             placed: (B, K) 1 where a token is placed.
             goals: (B, V, 2) of the target.
 
         Returns:
-            (B,) which token, (B,) 1 where it is turned over, and (B, 3) its velocity in [-1, 1].
+            (B,) index of the token, (B,) 1 where it is turned over, (B, 3) velocity in [-1, 1].
 
         Raises:
             ConfigError: see `untraced`.
@@ -105,16 +105,16 @@ class Planner(nn.Module):
         return self.token[which[:, 0]], self.flip[which[:, 0]], velocity[:, 0]
 
     def _scene(self, corners: Tensor, goals: Tensor) -> Scene:
-        """Poses and what is covered; geometry is in double precision, what networks see is not."""
+        """Poses and coverage; computed in double precision, given to networks in single."""
         lying, wanted = self._covered(corners), self._covered(goals)
         shares = self._covered.shares(lying, wanted)
         return Scene(*_pose(*lying), *_pose(*wanted), *(one.float() for one in shares))
 
     def _candidates(self, placed: Tensor) -> tuple[Tensor, Tensor]:
-        """Which candidates (B, N) there are, and whether they may be played.
+        """Indices (B, N) of candidates, and whether each of them may be played.
 
-        Those whose token is open, the first token's where none is. In play only as many as a row of
-        them needs; where it is written down shapes hang on B alone.
+        Those of open tokens may be played, or those of the first token if none is open. While
+        acting N is as small as possible. In an export N is fixed: shapes must depend on B alone.
         """
         is_open = placed == 0
         allowed = (is_open | ((self.tokens == 0) & ~is_open.any(1, keepdim=True)))[:, self.token]
@@ -149,7 +149,7 @@ class Planner(nn.Module):
         return values
 
     def _gained(self, scene: Scene, rows: Tensor, which: Tensor, pose: Tensor) -> Tensor:
-        """(B, N') what candidates in poses are worth for all pieces, less what they give up."""
+        """Values (B, N') of candidates at poses for all pieces, minus the tokens' present worth."""
         count = self._tokens
         every = which.repeat_interleave(count, dim=1)
         piece = self.tokens.repeat(which.shape[1]).expand(every.shape)
@@ -159,6 +159,6 @@ class Planner(nn.Module):
 
 
 def _pose(centres: Tensor, turns: Tensor, flipped: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses (B, K, 3) and sides (B, K) of what `Covered` says, in single precision."""
+    """Poses (B, K, 3) and sides (B, K) in single precision, from the result of `Covered`."""
     angles = torch.atan2(turns[..., 1].float(), turns[..., 0].float())
     return torch.cat([centres.float(), angles[..., None]], dim=-1), flipped.float()

@@ -1,8 +1,8 @@
-"""Pushing tokens into place: random pushes of each token, and a critic that says what they lead to.
+"""The agent that pushes tokens into place: a critic values random pushes of each token.
 
-Start with `agent.py`: the settings. `scenes.py` has what is on tables, and the geometry; `seen.py`
-what networks see of it, in the frame of the token that is pushed; `networks.py` the critic, and
-what a push does to a token alone, both learned; `choosing.py` which push is best; `actor.py` acts
-in workers, `learner.py` learns in the master. May import tangram_agent.base, flat and nets,
+Start with `agent.py`: the settings. `scenes.py` has tables as tensors, and the geometry. `seen.py`
+makes the network inputs, in the frame of the pushed token. `networks.py` has the critics and the
+model of a token that is pushed alone, both learned. `choosing.py` finds the best push. `actor.py`
+acts in workers, `learner.py` learns in the master. May import tangram_agent.base, flat and nets,
 tangram_tasks.push, tangram_sim.geometry, tangram_core and torch.
 """

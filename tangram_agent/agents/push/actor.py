@@ -1,4 +1,4 @@
-"""Acting in workers: the push of the best value.
+"""The actor in workers: it plays the push of the best value.
 
 Legend: B environments, K tokens.
 """
@@ -23,15 +23,15 @@ from tangram_tasks.push.task import Push
 from tangram_tasks.push.trials import Trials, middle
 
 CPU = torch.device("cpu")
-_THEN = 32  # pushes of each token that are looked at after one that is tried out
-_SURE = 4  # times as many pushes are looked at where nothing is tried out
-_SAME = 0.003  # a token that moves and turns less has not moved
-_STILL = 1e-4  # corners that are all nearer than this have not moved
-_AGAIN = 100.0  # cost of what has been before
+_THEN = 32  # pushes of each token that are valued after a push that was tried in an engine
+_SURE = 4  # times as many pushes are valued without exploration
+_SAME = 0.003  # a token that moves and turns less counts as unmoved
+_STILL = 1e-4  # if all corners move less, nothing has moved
+_AGAIN = 100.0  # cost of a push that leads back to an earlier state
 
 
 class Played(nn.Module):
-    """What a broadcast brings."""
+    """The networks in a broadcast: the critics and the table of pushes."""
 
     def __init__(self, task: Push, width: int) -> None:
         super().__init__()
@@ -49,9 +49,9 @@ class PushActor(NetworkActor):
         self._task, self._config, self._tokens = task, config, Tokens(task, CPU)
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:
-        """(B, 4) of corners and goals (B, V, 2).
+        """Actions (B, 4) for corners and goals (B, V, 2).
 
-        Where it explores, other pushes are drawn each time, and some are any.
+        While exploring, new pushes are drawn at each step, and a share of actions is random.
         """
         tokens, tried = self._tokens, self._config.tried
         corners, goals = seen["corners"], seen["goals"]
@@ -94,11 +94,11 @@ class PushActor(NetworkActor):
     def _tried(
         self, corners: Array, goals: Array, actions: Floats, possible: Bools, past: History
     ) -> torch.Tensor:
-        """(B,) which of pushes (B, M, 4) leads to the best, tried in an engine.
+        """Index (B,) of the best of pushes (B, M, 4), tried in a physics engine.
 
-        What the tokens that it moves are then worth, less what they are now. What moves hardly
-        anything, or leads to what has been before, is not sought: but for one that brings a token
-        home. Nor is what is not possible (B, M), or what the engine refuses.
+        The gain of a push is the value of the tokens that it moves afterwards, minus their value
+        now. A push that leads to the present or an earlier state costs `_AGAIN`, unless it brings a
+        token home. Pushes that are not possible (B, M) or that the engine refuses are excluded.
         """
         after, refused = self._followed(corners, goals, actions, possible)
         tokens, times = self._tokens, actions.shape[1]
@@ -107,7 +107,7 @@ class PushActor(NetworkActor):
         moved = (then.poses - before.poses).abs().amax(-1) > _SAME
         gained = (self._values(then, moved) - self._values(before, moved)).sum(1)
         comes_home = tokens.placed(then).sum(1) > tokens.placed(before).sum(1)
-        nearest = np.full(refused.shape, np.inf)  # what it leads to, to what has been
+        nearest = np.full(refused.shape, np.inf)  # from each result to any state so far
         for moment in np.moveaxis(past.seen["corners"], 1, 0):
             np.minimum(nearest, np.abs(after - moment[:, None]).max(axis=(2, 3)), out=nearest)
         again = torch.from_numpy(nearest < self._task.config.within / 2.0).flatten() & ~comes_home
@@ -131,9 +131,9 @@ class PushActor(NetworkActor):
         return after, refused
 
     def _values(self, scene: Scene, wanted: torch.Tensor) -> torch.Tensor:
-        """(n, K) of tokens that are wanted (n, K), each with the one beside it; of others 0.
+        """Values (n, K) of the wanted tokens (n, K), each with the one beside it.
 
-        And of those in their places.
+        0 for other tokens, and for those in their places.
         """
         asked = scene.present & wanted & ~self._tokens.placed(scene)
         rows, slots = asked.nonzero(as_tuple=True)
@@ -142,11 +142,11 @@ class PushActor(NetworkActor):
         value = self._best(some, pairs, Search(_all_pushes(len(rows)), _THEN))[0][:, 0]
         least = -1.0 / (1.0 - self._config.gamma)
         found = torch.zeros(asked.shape)
-        found[rows, slots] = value.clamp(least, -0.5)  # one more push at least
+        found[rows, slots] = value.clamp(least, -0.5)  # at least one more push is needed
         return found
 
     def _pairs(self, scene: Scene) -> torch.Tensor:
-        """(2, n, K) all tokens, and those beside them."""
+        """Slots (2, n, K) of all tokens, and of those beside them."""
         count = self._task.count
         slots = torch.arange(count).expand(len(scene.poses), -1)
         others = beside(scene.repeated(count), slots.flatten())
@@ -157,18 +157,18 @@ class PushActor(NetworkActor):
         return Trials(self._task)
 
     def _drawn(self, count: int, explore: Generators | None) -> tuple[torch.Tensor, Floats]:
-        """(B * K, P) pushes to look at, and three numbers (B, 3) in [0, 1) for each environment."""
+        """Indices (B * K, P) of pushes to value, and random numbers (B, 3) in [0, 1) to explore."""
         each = self._task.count
         if explore is None:  # all of them, always in the same order
             return _all_pushes(count * each), np.ones((count, 3))
         size = (each, 2 * self._config.looked_at)
         drawn = [(one.integers(PUSHES, size=size), one.random(3)) for one in explore]
         pushes, numbers = (np.stack(part) for part in zip(*drawn, strict=True))
-        return torch.from_numpy(pushes.reshape(count * each, -1)), numbers  # singles may be 1
+        return torch.from_numpy(pushes.reshape(count * each, -1)), numbers  # float64: below 1
 
 
 def _made_here(corners: Array, actions: Floats, past: History) -> Bools:
-    """(B, M) which of pushes (B, M, 4) were made already where all lay as it does now (B, V, 2)."""
+    """(B, M) whether pushes (B, M, 4) were made before, when all corners (B, V, 2) were as now."""
     off = np.abs(past.seen["corners"][:, :-1] - corners[:, None])
     same = np.isclose(past.actions[:, None], actions[:, :, None]).all(axis=-1)
     made: Bools = (same & (off.max(axis=(2, 3)) < _STILL)[:, None]).any(axis=-1)
@@ -176,5 +176,5 @@ def _made_here(corners: Array, actions: Floats, past: History) -> Bools:
 
 
 def _all_pushes(rows: int) -> torch.Tensor:
-    """(rows, 1024), always in the same order."""
+    """Indices (rows, 1024) of all pushes, in the same order in each row."""
     return torch.arange(PUSHES).expand(rows, -1)

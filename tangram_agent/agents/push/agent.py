@@ -1,4 +1,4 @@
-"""The agent of pushes: settings, without tensors."""
+"""The agent of pushes, and its settings; does not import torch."""
 
 from dataclasses import dataclass
 from typing import ClassVar, cast
@@ -13,20 +13,20 @@ from tangram_tasks.push.task import Push
 
 @dataclass(frozen=True)
 class PushingConfig(EpisodeConfig, section="agent"):
-    """Its critic, and how many pushes that looks at."""
+    """Settings of the critic, and the number of pushes that it values."""
 
     width: int = setting(128, "width of all layers", low=8, high=4096, part=NETWORK)
     looked_at: int = setting(
         96,
-        "pushes of each token that the critic values before one is played while it learns; four "
-        "times as many are later",
+        "pushes of each token that the critic values for each action while it learns; four times "
+        "as many afterwards",
         low=2,
         high=1024,
     )
     tried: int = setting(
         0,
-        "of these, the best that it tries in an engine of its own, at the middle of the ranges of "
-        "friction, before one is played; 0: none, and none while it learns",
+        "number of the best of these pushes that are tried in a physics engine before each action, "
+        "with friction at the middle of its ranges; 0: none; not used while it learns",
         low=0,
         high=1024,
     )
@@ -41,7 +41,7 @@ class Pushing(Agent):
 
     @property
     def pace(self) -> Pace:
-        """As the settings say."""
+        """The pace in the settings."""
         return Pace(self.config.updates_per_transition, self.config.learning_starts)
 
     def check(self, task: Task) -> None:
@@ -49,21 +49,21 @@ class Pushing(Agent):
         if not isinstance(task, Push):
             kind = type(task).__name__.lower()
             raise ConfigError(
-                f"agent=push learns task=push alone, got task={kind}: set agent={task.agent}"
+                f"agent=push learns only task=push, got task={kind}: set agent={task.agent}"
             )
 
     def actor(self, task: Task) -> Actor:
-        """The critic, to be loaded."""
+        """An actor whose weights are to be loaded."""
         from tangram_agent.agents.push.actor import PushActor  # noqa: PLC0415
 
         return PushActor(cast("Push", task), self.config)
 
     def learner(self, task: Task, seed: int, device: str, *, compiled: bool = False) -> Learner:
-        """With the weights of a seed."""
+        """A learner with the weights of a seed."""
         from tangram_agent.agents.push.learner import PushLearner  # noqa: PLC0415
 
         return PushLearner(cast("Push", task), self.config, seed, device, compiled=compiled)
 
     def facts(self) -> Json:
-        """Its name, and that of its network."""
+        """Names of the agent and of its network, for reports."""
         return {"agent": "push", "net": f"pairs, {self.config.width} wide"}

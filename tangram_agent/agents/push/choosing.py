@@ -1,6 +1,7 @@
-"""Which push is best, by critics, of many that are drawn.
+"""Choice of the best push by critics, among many that are drawn.
 
-Legend: n tables, K tokens of each, P pushes that are drawn for each token, N that are looked at.
+Legend: n tables, k tokens of each that may be pushed, S tokens of the set, P pushes drawn for each
+token, N of them that are valued, M results.
 """
 
 from dataclasses import dataclass, replace
@@ -12,19 +13,19 @@ from tangram_agent.agents.push.networks import Twins
 from tangram_agent.agents.push.scenes import Scene, Tokens
 from tangram_agent.agents.push.seen import Seen, pushes, seen_by
 
-NEVER = -1e3  # value of what cannot be done
+NEVER = -1e3  # value of impossible pushes
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Which pushes are looked at.
+    """Which pushes are valued.
 
     Attributes:
-        drawn: (n * k, P) numbers of pushes.
-        count: of pushes of each token that are looked at: the half after which least is left to go
-            if it is alone, and the first that were drawn.
-        most: M, those that are least worse than the best of the same token.
-        eligible: (n, k) which tokens are pushed if one can be; None: all not in their places.
+        drawn: (n * k, P) indices of the drawn pushes.
+        count: N. Half are the pushes after which the token, if alone, is nearest to its place; the
+            other half are the first ones drawn.
+        most: M, results for each table: the pushes nearest in value to the best of their token.
+        eligible: (n, k) which tokens to push if any of them can be; None: all out of place.
     """
 
     drawn: Tensor
@@ -36,19 +37,19 @@ class Search:
 def best(
     critics: Twins, moved: Tensor, tokens: Tokens, scene: Scene, pairs: Tensor, search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The best pushes of each table: values (n, M), slots of their tokens, and which.
+    """The best pushes of each table: values, slots of their tokens, and indices, each (n, M).
 
-    One critic chooses, the lesser of both says what they are worth: until a token and the one
-    beside it are in their places. NEVER is the value of what cannot be done, or may not: those in
-    their places are not pushed.
+    The first critic chooses; the value is the lower one of both critics. It counts until a token
+    and the one beside it are in place. Pushes that are impossible or not allowed have the value
+    NEVER. Tokens in place must not be pushed.
 
     Args:
-        critics: who value.
-        moved: (S, 1024, 3) what pushes do to tokens alone.
-        tokens: the set.
+        critics: two critics.
+        moved: (S, 1024, 3) motions of tokens that are pushed alone.
+        tokens: the set of tokens.
         scene: n tables.
         pairs: (2, n, k) slots of the tokens that may be pushed, and of those beside them.
-        search: for which pushes.
+        search: which pushes to value.
     """
     _, size, each = pairs.shape
     flat, beside = pairs.flatten(1)
@@ -83,7 +84,7 @@ def best(
 
 
 def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: int) -> Tensor:
-    """(n, N) of the pushes (n, P) that are drawn."""
+    """Indices (n, N) of the pushes to value, among those drawn (n, P)."""
     own = seen.which[:, None]
     left = tokens.after(seen.left[:, None], moved[own, drawn], own)
     far = left[..., :2].square().sum(-1) / tokens.within**2
@@ -93,5 +94,5 @@ def _looked_at(tokens: Tokens, seen: Seen, moved: Tensor, drawn: Tensor, count: 
 
 
 def _only(seen: Seen, rows: Tensor) -> Seen:
-    """With what critics see of these rows alone."""
+    """A copy with the critics' inputs of only these rows."""
     return replace(seen, token=seen.token[rows], other=seen.other[rows], there=seen.there[rows])

@@ -1,7 +1,7 @@
-"""Learning in the master: Q-learning over the pushes that are looked at, with hindsight.
+"""The learner in the master: Q-learning with hindsight over a sample of pushes.
 
-Of many tokens two are learned from at a time, the one that was pushed and the one beside it: until
-both are in place, nobody pushes another. What it costs to push others out of theirs is set.
+Values count two tokens, the pushed one and the one beside it: as if no other token were pushed
+until both are in place. To push a third token out of its place has a fixed cost.
 
 Legend: B transitions, K tokens, V corners, P pushes drawn for each token.
 """
@@ -32,27 +32,27 @@ from tangram_core.spec import Array, Arrays, Episodes
 from tangram_tasks.push.places import ways_of
 from tangram_tasks.push.task import Push
 
-_DRAWN = 96  # P: pushes of which those are taken that a target looks at
-_PAIR = 2  # tokens whose pushes a target looks at
-_LOST = 2.0  # what it costs to push a third token out of its place: some pushes until it is back
-_RENEWED = 20  # updates after which the table of pushes is
+_DRAWN = 96  # P: drawn pushes, from which a target takes those that it values
+_PAIR = 2  # tokens whose pushes a target values
+_LOST = 2.0  # cost of a third token that is pushed out of place: pushes that bring it back
+_RENEWED = 20  # updates between two renewals of the table of pushes
 _LAST = 0.1  # share of the learning rate that is left at the end of a budget
-_LOOKED_AT = 8  # pushes of each token of which a target takes the best
-_SOME_SHARE = 0.3  # of the goals of hindsight that are another for some of the tokens alone
-_STILL = 1e-4  # way of a token that did not move
+_LOOKED_AT = 8  # pushes of each token that a target values
+_SOME_SHARE = 0.3  # share of hindsight goals that replace the goals of only some tokens
+_STILL = 1e-4  # a token that moves less did not move
 _TURN = 0.2  # length that a turn by one radian counts as
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What the losses see.
+    """A batch for the losses.
 
     Attributes:
-        poses, following, goals: (B, K, 3) where tokens were, came to, and should come.
+        poses, following, goals: (B, K, 3) poses of tokens before and after the push, and goals.
         which, present: (B, K) see `Scene`.
-        slots, others: (B,) of the token that was pushed, and of the one beside it.
-        begins, ends: (B, 2) of the finger, on the table.
-        drawn: (2 * B, P) pushes that may be the best that follows.
+        slots, others: (B,) slots of the pushed token, and of the one beside it.
+        begins, ends: (B, 2) first and last position of the finger, on the table.
+        drawn: (2 * B, P) indices of drawn pushes, among which the target finds the next one.
     """
 
     poses: Tensor
@@ -68,26 +68,26 @@ class Batch:
 
     @property
     def arrays(self) -> Arrays:
-        """All of it, by name."""
+        """The arrays of the batch, by name."""
         return {name: one.cpu().numpy() for name, one in vars(self).items()}
 
     def at(self, poses: Tensor) -> Scene:
-        """The scene with tokens at poses."""
+        """The scene with tokens at the given poses."""
         return Scene(poses, self.goals, self.which, self.present)
 
 
 def lengths(terminated: Array) -> Ints:
-    """(E,) steps to the first at which episodes (E, T) terminated, or all."""
+    """Number of steps (E,) until episodes (E, T) first terminated; T if they did not."""
     ended = terminated.astype(bool)
     counts: Ints = np.where(ended.any(1), ended.argmax(1) + 1, ended.shape[1])
     return counts
 
 
 class PushReplay(EpisodeReplay):
-    """Goals of hindsight are what was reached, for all tokens or for some."""
+    """Replay buffer whose hindsight goals are reached poses of all tokens, or of some."""
 
     def chosen(self, config: EpisodeConfig, rng: Streams) -> tuple[Ints, Ints, Array]:
-        """Which episodes (B,) and steps (B,) before all was in place, and goals (B, V, 2).
+        """Draw episodes (B,), steps (B,) before their termination, and goals (B, V, 2).
 
         Raises:
             ValueError: the replay is empty.
@@ -112,7 +112,7 @@ class PushReplay(EpisodeReplay):
         return np.where(mask, reached, desired)
 
     def _look(self, slots: Ints) -> None:
-        """Note when episodes ended."""
+        """Store the lengths of new episodes."""
         self._lengths[slots] = lengths(self.arrays["terminated"][slots])
 
     @cached_property
@@ -121,54 +121,54 @@ class PushReplay(EpisodeReplay):
 
 
 class PushLearner(NetworkLearner):
-    """Critics, and what a push does to a token alone."""
+    """Learner of the critics, and of the model of a token that is pushed alone."""
 
     replay: PushReplay
 
     def __init__(
         self, task: Push, config: PushingConfig, seed: int, device: str, *, compiled: bool = False
     ) -> None:
-        """Networks with the weights of a seed, and an empty replay."""
+        """Initialise the networks from a seed and make an empty replay buffer."""
         self.config, self.polyak, self._task = config, config.polyak, task
         place = torch.device(device)
         self._tokens = Tokens(task, place)
         self.replay = PushReplay(task, config.replay_capacity)
         self.capacity = self.replay.capacity * task.spec.horizon
         corners = task.layout.padded_corners.shape[1]
-        with torch.random.fork_rng(devices=[]):  # what others draw from torch stays as it is
+        with torch.random.fork_rng(devices=[]):  # leaves torch's global generator unchanged
             torch.default_generator.manual_seed(seed)
             played, self.alone = Played(task, config.width), Alone(corners, config.width)
         self.critic, self.table = played.critic, played.table
         learned = {"critic": self.critic, "alone": self.alone}
         others = {"table": self.table}
         super().__init__(learned, ("critic",), device, compiled=compiled, others=others)
-        self.table.renew(self.alone, self._tokens)  # pushes that all do nothing are all alike
+        self.table.renew(self.alone, self._tokens)  # with zeros all pushes would look alike
 
     def rates(self, share: float) -> Rates:
-        """The same for all networks; they fall along a cosine as the budget is used."""
+        """Equal rates for all networks; they fall along a cosine as the budget is used."""
         falls = 0.5 * (1.0 + math.cos(math.pi * min(max(share, 0.0), 1.0)))
         rate = self.config.learning_rate * (_LAST + (1.0 - _LAST) * falls)
         return Rates(rate, rate, 0.0)
 
     @property
     def kept(self) -> int:
-        """Transitions in the replay."""
+        """Number of transitions in the replay buffer."""
         return len(self.replay) * self._task.spec.horizon
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
-        """Keep whole episodes: goals are relabelled when a batch is drawn."""
+        """Add whole episodes; their goals are relabelled when a batch is drawn."""
         self.replay.add(episodes)
         return int(lengths(episodes.terminated).sum())
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
-        """One of all networks; now and then the table of pushes is renewed."""
+        """Make one update of all networks; every 20th time renew the table of pushes."""
         numbers = super().update(share, rng)
         if self.updates % _RENEWED == 0:
             self.table.renew(self.alone, self._tokens)
         return numbers
 
     def drawn(self, rng: Streams) -> Batch:
-        """What the next update learns from."""
+        """Draw the batch of an update from the replay buffer."""
         task, config, arrays = self._task, self.config, self.replay.arrays
         rows, steps, desired = self.replay.chosen(config, rng)
         before, following = (arrays["corners"][rows, steps + i] for i in (0, 1))
@@ -194,7 +194,7 @@ class PushLearner(NetworkLearner):
         return batch
 
     def blanks(self) -> Iterator[Batch]:
-        """All at rest at the middle of the table."""
+        """An example batch to compile for: all tokens at the middle of the table."""
         size, count = self.config.batch_size, self._task.count
         poses = torch.zeros(size, count, 3, device=self.place)
         which = torch.zeros(size, count, dtype=torch.int64, device=self.place)
@@ -205,7 +205,7 @@ class PushLearner(NetworkLearner):
         yield Batch(*scene, *push, drawn)
 
     def losses(self, seen: Batch) -> Iterator[Loss]:
-        """What pushes do to a token alone, and what they are worth."""
+        """Yield the loss of the model of tokens pushed alone, then that of the critics."""
         tokens = self._tokens
         with torch.no_grad():
             target = self._target(seen)
@@ -223,7 +223,7 @@ class PushLearner(NetworkLearner):
         yield Loss("critic", error, {"q": values.mean()})
 
     def _target(self, seen: Batch) -> Tensor:
-        """(B,) r + gamma (1 - d) max Q', within what rewards can add up to."""
+        """Targets (B,) r + gamma (1 - d) max Q', clamped to the possible sums of rewards."""
         tokens, config = self._tokens, self.config
         critic: Twins = self.targets["critic"]  # type: ignore[assignment]
         scene, count = seen.at(seen.following), _LOOKED_AT
@@ -235,13 +235,13 @@ class PushLearner(NetworkLearner):
         before, after = (tokens.placed(one) for one in (seen.at(seen.poses), scene))
         lost = (before & ~after & scene.present).scatter(1, pair, value=False).sum(1)
         there, placed = scene.present.gather(1, pair), after.gather(1, pair)
-        reward = (placed & there).sum(1) / there.sum(1) - 1.0 - _LOST * lost  # of two as the task
+        reward = (placed & there).sum(1) / there.sum(1) - 1.0 - _LOST * lost  # as in the task
         goes_on = ~(placed | ~there).all(1)
         target = reward + config.gamma * goes_on * value.clamp(least, 0.0)
         return target.clamp(least, 0.0)
 
     def _alone(self, seen: Batch, moved: Tensor) -> Loss:
-        """Of the pushes that moved one token, and no other."""
+        """The loss of the model of tokens pushed alone, over pushes that moved no other token."""
         rows = torch.arange(len(moved), device=moved.device)
         still = (seen.following - seen.poses).abs().amax(-1) < _STILL
         pushed = torch.arange(still.shape[1], device=moved.device) == seen.slots[:, None]
@@ -256,7 +256,7 @@ class PushLearner(NetworkLearner):
         return Loss("alone", mean, {"alone": counts.to(moved.dtype).mean()})
 
     def broadcast(self) -> Tensors:
-        """The critics, averaged, and the table of pushes."""
+        """The averaged critics and the table of pushes."""
         averaged = to_arrays(self.targets["critic"])
         critic = {f"critic.{name}": value for name, value in averaged.items()}
         return {**critic, "table.moved": to_arrays(self.table)["moved"]}

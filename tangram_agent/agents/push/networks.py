@@ -1,6 +1,6 @@
-"""What a push does to a token alone, and what it is worth.
+"""The critics of pushes, and the model of a token that is pushed alone.
 
-Legend: n rows, F, G numbers of a token and of another one, K tokens, N pushes, W width.
+Legend: n rows, C corners, N pushes.
 """
 
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from tangram_agent.agents.push.scenes import PUSHES, Tokens
 from tangram_agent.agents.push.seen import PUSH, Seen, other_numbers, token_numbers
 from tangram_agent.nets.networks import perceptron, untraced
 
-_FAR = 0.2  # of a token that is pushed
+_FAR = 0.2  # scale of the motion of a pushed token
 
 
 class Critic(nn.Module):
-    """Values of pushes: the token and another one, then each push beside them."""
+    """Critic of pushes: its inputs are the pushed token, another one, and each push."""
 
     def __init__(self, corners: int, width: int) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class Critic(nn.Module):
         self.value = nn.Sequential(*_ended(width), perceptron(width, (width,), 1, norm=True))
 
     def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
-        """(n, N) of pushes (n, N, 22)."""
+        """Values (n, N) of pushes (n, N, 22)."""
         untraced()
         other = self.others(self.other(seen.other) * seen.there)
         scene = self.scene(self.mixed(self.token(seen.token) + other))
@@ -40,9 +40,9 @@ class Critic(nn.Module):
 
 
 class Twins(nn.Module):
-    """Two critics, of which the lesser counts (Fujimoto et al. 2018).
+    """Two critics, of which the lower value counts (Fujimoto et al. 2018).
 
-    Their weights lie one behind the other, so both are computed in one go.
+    Their weights are stacked, so that both are computed in one call.
     """
 
     def __init__(self, corners: int, width: int) -> None:
@@ -51,15 +51,15 @@ class Twins(nn.Module):
         self._names = list(both)
         self.weights = nn.ParameterList(both.values())
         with torch.device("meta"):
-            self._form = [Critic(corners, width)]  # a list: no part of this module
+            self._form = [Critic(corners, width)]  # in a list: not a submodule
 
     def forward(self, seen: Seen, pushes: Tensor) -> Tensor:
-        """(2, n, N) of pushes (n, N, 22)."""
+        """Values (2, n, N) of pushes (n, N, 22) by both critics."""
         values: Tensor = vmap(lambda *own: self._value(own, seen, pushes))(*self.weights)
         return values
 
     def one(self, which: int, seen: Seen, pushes: Tensor) -> Tensor:
-        """(n, N) of one of them."""
+        """Values (n, N) of pushes (n, N, 22) by one critic."""
         return self._value([both[which] for both in self.weights], seen, pushes)
 
     def _value(self, weights: Sequence[Tensor], seen: Seen, pushes: Tensor) -> Tensor:
@@ -69,21 +69,21 @@ class Twins(nn.Module):
 
 
 class Alone(nn.Module):
-    """Where a token goes that is pushed and touches no other; frictions are averaged over."""
+    """Model of the motion of a pushed token that touches no other, averaged over friction."""
 
     def __init__(self, corners: int, width: int) -> None:
         super().__init__()
         self.layers = perceptron(2 * corners + 4, (width, width), 3, norm=True)
 
     def forward(self, outlines: Tensor, begins: Tensor, ends: Tensor) -> Tensor:
-        """(..., 3) in its own frame, of its outline (..., C, 2) and the finger's way (..., 2)."""
+        """Motions (..., 3) of outlines (..., C, 2) by pushes (..., 2), in the tokens' frames."""
         parts = outlines.flatten(-2) * 3.0, begins * 4.0, (ends - begins) * 4.0
         moved: Tensor = self.layers(torch.cat(parts, dim=-1)) * _FAR
         return moved
 
 
 class Table(nn.Module):
-    """What `Alone` says of the pushes that are always the same: looked up, not computed."""
+    """Stored results of `Alone` for the fixed set of pushes."""
 
     def __init__(self, tokens: int) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class Table(nn.Module):
 
     @torch.no_grad()
     def renew(self, alone: Alone, tokens: Tokens) -> None:
-        """As the network has it now."""
+        """Recompute the table with the present network."""
         outlines = tokens.outlines[:, None].expand(*tokens.begins.shape[:2], -1, -1)
         self.moved.copy_(alone(outlines, tokens.begins, tokens.ends))
 

@@ -1,6 +1,6 @@
 """Tables with tokens as tensors, and the geometry of convex polygons.
 
-Polygons have x and y first, then their corners: so one operation goes through all rows.
+The first axis of polygons is x and y, the second their corners: so operations go through all rows.
 Legend: n rows, K tokens of a row, S tokens of the set, C corners of the largest, N pushes.
 """
 
@@ -15,18 +15,18 @@ from tangram_core.spec import Array
 from tangram_tasks.push.places import on_table, ways_of
 from tangram_tasks.push.task import Push
 
-PUSHES = 1024  # random ones of each token, of which the best are looked for
-_SEED = 0  # theirs: whoever plays and who learns have the same
+PUSHES = 1024  # random pushes of each token, among which the best is chosen
+_SEED = 0  # of the pushes: the same in workers and in the master
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What lies on n tables, and where it should come.
+    """Tokens on n tables, and their goals.
 
     Attributes:
         poses, goals: (n, K, 3) x, y and angle.
-        which: (n, K) which tokens of the set these are.
-        present: (n, K) of them that are on the table.
+        which: (n, K) indices of the tokens in the set.
+        present: (n, K) whether each token is on the table.
     """
 
     poses: Tensor
@@ -35,26 +35,26 @@ class Scene:
     present: Tensor
 
     def repeated(self, count: int) -> "Scene":
-        """Every row so many times."""
+        """Each row repeated `count` times."""
         return Scene(*(one.repeat_interleave(count, 0) for one in vars(self).values()))
 
     def only(self, rows: Tensor) -> "Scene":
-        """These rows."""
+        """The scene of these rows."""
         return Scene(*(one[rows] for one in vars(self).values()))
 
 
 class Tokens:
-    """What is the same on all tables.
+    """Shapes, pushes and tolerances of a set of tokens, the same for all tables.
 
     Attributes:
-        count: K.
-        outlines: (S, C, 2) in their own frames; the smaller ones repeat their last corner.
-        corners: (2, C, S) the same.
-        periods: (S,) turns that change nothing.
-        begins, ends: (S, N, 2) of the finger, in the frames of the tokens.
-        actions: (S, N, 4) these pushes, as the task takes them.
-        within, turned: tolerances of a token that is in place.
-        finger: its radius.
+        count: K, number of tokens in a row.
+        outlines: (S, C, 2) corners in the tokens' frames; the smaller ones repeat their last.
+        corners: (2, C, S) the same corners with other axes.
+        periods: (S,) smallest turns that leave the shapes as they are.
+        begins, ends: (S, N, 2) first and last position of the finger, in the tokens' frames.
+        actions: (S, N, 4) these pushes as actions of the task.
+        within, turned: tolerances of position and angle of a token in place.
+        finger: radius of the finger.
     """
 
     def __init__(self, task: Push, place: torch.device) -> None:
@@ -82,7 +82,7 @@ class Tokens:
         self._place = place
 
     def scene(self, corners: Array, goals: Array) -> Scene:
-        """Of corners (n, V, 2): those on the table first."""
+        """The scene of corners and goals (n, V, 2); tokens on the table come first."""
         there = on_table(goals, self._layout)
         which = np.argsort(~there, axis=1, kind="stable")[:, : self.count].copy()
         present = torch.from_numpy(np.take_along_axis(there, which, 1)).to(self._place)
@@ -90,40 +90,40 @@ class Tokens:
         return Scene(self.poses(corners, tokens), self.poses(goals, tokens), tokens, present)
 
     def poses(self, corners: Array, which: Tensor) -> Tensor:
-        """(n, K, 3) of these tokens (n, K), of corners (n, V, 2)."""
+        """Poses (n, K, 3) of the tokens `which` (n, K), from corners (n, V, 2)."""
         every = self._layout.poses(np.asarray(corners, np.float64)).astype(np.float32)
         poses = torch.from_numpy(every).to(self._place)
         return poses.gather(1, which[..., None].expand(-1, -1, 3))
 
     def placed(self, scene: Scene) -> Tensor:
-        """(n, K) which tokens are in place."""
+        """(n, K) whether each token is in place."""
         left = self.left(scene.poses, scene.goals, scene.which)
         return self.near(left)
 
     def near(self, left: Tensor) -> Tensor:
-        """(...) whether ways that are left (..., 3) are within the tolerance."""
+        """(...) whether remaining ways (..., 3) are within the tolerances."""
         far: Tensor = left[..., :2].norm(dim=-1)
         return (far <= self.within) & (left[..., 2].abs() <= self.turned)
 
     def wrapped(self, angles: Tensor, which: Tensor) -> Tensor:
-        """The least of turns (...) that come to the same."""
+        """The smallest turns (...) with the same result as the given angles."""
         period = self.periods[which]
         return angles - period * torch.round(angles / period)
 
     def left(self, poses: Tensor, goals: Tensor, which: Tensor) -> Tensor:
-        """(..., 3) the way from poses to goals (..., 3), in the token's frame."""
+        """Remaining ways (..., 3) from poses to goals (..., 3), in the tokens' frames."""
         way = rotated(goals[..., :2] - poses[..., :2], -poses[..., 2])
         turn = self.wrapped(goals[..., 2] - poses[..., 2], which)
         return torch.cat([way, turn[..., None]], dim=-1)
 
     def after(self, left: Tensor, moved: Tensor, which: Tensor) -> Tensor:
-        """(..., 3) what is left of ways where tokens move by (..., 3) in their own frames."""
+        """Remaining ways (..., 3) after tokens move by (..., 3) in their own frames."""
         way = rotated(left[..., :2] - moved[..., :2], -moved[..., 2])
         turn = self.wrapped(left[..., 2] - moved[..., 2], which)
         return torch.cat([way, turn[..., None]], dim=-1)
 
     def laid(self, poses: Tensor, which: Tensor) -> Tensor:
-        """(2, C, ...) outlines of tokens at poses (..., 3)."""
+        """Outlines (2, C, ...) of tokens at poses (..., 3)."""
         cos, sin = torch.cos(poses[..., 2]), torch.sin(poses[..., 2])
         x, y = self.corners[:, :, which]
         laid = cos * x - sin * y + poses[..., 0], sin * x + cos * y + poses[..., 1]
@@ -138,13 +138,13 @@ def rotated(vectors: Tensor, angles: Tensor) -> Tensor:
 
 
 def placed_at(poses: Tensor, moved: Tensor) -> Tensor:
-    """(..., 3) where tokens at poses come to that move by (..., 3) in their own frames."""
+    """Poses (..., 3) of tokens after they move by (..., 3) in their own frames."""
     way = rotated(moved[..., :2], poses[..., 2]) + poses[..., :2]
     return torch.cat([way, poses[..., 2:] + moved[..., 2:]], dim=-1)
 
 
 def distance(outlines: Tensor, points: Tensor) -> Tensor:
-    """(...) from points (2, ...) to convex polygons (2, C, ...); 0 inside."""
+    """Distances (...) from points (2, ...) to convex polygons (2, C, ...); 0 inside."""
     edges, to = outlines.roll(-1, 1) - outlines, points[:, None] - outlines
     squares = _dot(edges, edges)
     share = (_dot(to, edges) / squares.clamp_min(1e-9)).clamp(0.0, 1.0)
@@ -156,10 +156,10 @@ def distance(outlines: Tensor, points: Tensor) -> Tensor:
 
 
 def gap(some: Tensor, others: Tensor) -> Tensor:
-    """(...) between convex polygons (2, C, ...); where they overlap minus the depth.
+    """Gaps (...) between convex polygons (2, C, ...); minus the depth where they overlap.
 
-    The largest distance along a normal of an edge (the separating axis theorem): where corner
-    stands against corner, the true distance is more.
+    The largest distance along a normal of an edge (the separating axis theorem). Between two
+    corners the true distance is larger.
     """
     found = []
     for one, other in ((some, others), (others, some)):
@@ -173,5 +173,5 @@ def gap(some: Tensor, others: Tensor) -> Tensor:
 
 
 def _dot(some: Tensor, others: Tensor) -> Tensor:
-    """(...) of vectors (2, ...)."""
+    """Dot products (...) of vectors (2, ...)."""
     return some[0] * others[0] + some[1] * others[1]

@@ -1,7 +1,7 @@
-"""What networks see of tokens and of pushes, in the frame of the token that is pushed.
+"""Network inputs for tokens and pushes, in the frame of the token that is pushed.
 
-They see one other token beside it, the one that matters most, and of all the others only how near
-a push comes to them. So what they learn of two tokens holds for seven.
+Networks see one other token, the one that matters most. Of all others they see only how near a push
+comes to them. So what they learn with two tokens also holds for seven.
 
 Legend: n rows, each with a token that may be pushed; K tokens of a row, C corners, N pushes.
 """
@@ -21,35 +21,35 @@ from tangram_agent.agents.push.scenes import (
 )
 from tangram_tasks.push.places import ARENA
 
-LEFT = 9  # numbers of a way that is left
-PUSH = 5 + LEFT + 8  # of a push: what moves, the table's edge, what is left, the others
-_LARGE = 3.0  # by which a token's corners come to about 1
-_NEAR = 0.1  # gaps above it are all alike
-_EDGE = 0.3  # so are distances from the table's edge
+LEFT = 9  # features of a remaining way
+PUSH = 5 + LEFT + 8  # features of a push: motion, table's edge, remaining way, other tokens
+_LARGE = 3.0  # factor that scales a token's corners to about 1
+_NEAR = 0.1  # larger gaps count as this
+_EDGE = 0.3  # larger distances from the table's edge count as this
 
 
 def token_numbers(corners: int) -> int:
-    """Of the token that is pushed: its way, its outline, its distance from the table's edge."""
+    """Number of features of the pushed token: way, outline, distance from the table's edge."""
     return LEFT + 2 * corners + 1
 
 
 def other_numbers(corners: int) -> int:
-    """Of another token: its way and outline, its pose and corners, and its place."""
+    """Number of features of another token: way, outline, pose, corners and goal."""
     return LEFT + 2 * corners + 4 + 2 * corners + 4
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A token, and what it sees of the others.
+    """Network inputs of n pushed tokens, and what pushes need to know of the other tokens.
 
     Attributes:
-        token: (n, F) itself.
-        other: (n, G) the one that matters most.
-        there: (n, 1) 1 where there is such a one.
-        pose, left: (n, 3) its pose, and its way to its place, in its own frame.
-        which: (n,) token of the set.
-        outlines: (2, C, n, K - 1) of all others, on the table.
-        placed: (n, K - 1) which of these are in their places.
+        token: (n, F) features of the pushed token.
+        other: (n, G) features of the other token that matters most.
+        there: (n, 1) 1 where there is such an other token.
+        pose, left: (n, 3) pose of the pushed token, and its remaining way in its own frame.
+        which: (n,) index of the pushed token in the set.
+        outlines: (2, C, n, K - 1) outlines of all others, on the table.
+        placed: (n, K - 1) whether each of the others is in place.
     """
 
     token: Tensor
@@ -63,9 +63,9 @@ class Seen:
 
 
 def beside(scene: Scene, slots: Tensor) -> Tensor:
-    """(n,) the tokens that matter most to those in slots (n,): nearest to them, or to their places.
+    """Slots (n,) of the tokens nearest to those in slots (n,), or nearest to their places.
 
-    Where there is no other, any that is not there, or the token itself.
+    Without another token on the table: an absent token, or the token itself.
     """
     rows = torch.arange(len(slots), device=slots.device)
     here, goal = (of[rows, slots, None, :2] for of in (scene.poses, scene.goals))
@@ -76,7 +76,7 @@ def beside(scene: Scene, slots: Tensor) -> Tensor:
 
 
 def seen_by(tokens: Tokens, scene: Scene, slots: Tensor, others: Tensor) -> Seen:
-    """What the tokens in slots (n,) see, beside them those in others (n,)."""
+    """Inputs for the tokens in `slots` (n,), with those in the slots `others` (n,) beside them."""
     rows, count = torch.arange(len(slots), device=slots.device), scene.poses.shape[1]
     left = tokens.left(scene.poses, scene.goals, scene.which)
     pose, which, own = scene.poses[rows, slots], scene.which[rows, slots], left[rows, slots]
@@ -111,7 +111,7 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor, others: Tensor) -> Seen
 
 
 def ways(tokens: Tokens, left: Tensor) -> Tensor:
-    """(..., 9) of ways that are left (..., 3): as they are, near the tolerance, and how long."""
+    """Features (..., 9) of remaining ways (..., 3): raw, scaled, log lengths, whether in place."""
     far, turn = left[..., :2].norm(dim=-1, keepdim=True), left[..., 2:].abs()
     place = (left[..., :2] / (6.0 * tokens.within)).clamp(-1.5, 1.5)
     angle = (left[..., 2:] / (6.0 * tokens.turned)).clamp(-1.5, 1.5)
@@ -121,7 +121,7 @@ def ways(tokens: Tokens, left: Tensor) -> Tensor:
 
 
 def edge(points: Tensor) -> Tensor:
-    """(..., 1) how near the table's edge points (..., 2) are."""
+    """Distances (..., 1) of points (..., 2) from the table's edge, scaled to [-1, 1]."""
     room = ARENA / 2.0 - points.abs().amax(-1, keepdim=True)
     return (room.clamp(0.0, _EDGE) / _EDGE - 0.5) * 2.0
 
@@ -129,14 +129,14 @@ def edge(points: Tensor) -> Tensor:
 def pushes(
     tokens: Tokens, seen: Seen, begins: Tensor, ends: Tensor, moved: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What is seen of pushes (n, N, 22), and which cannot be made (n, N).
+    """Features (n, N, 22) of pushes, and whether each push is impossible (n, N).
 
     Args:
-        tokens: the set.
-        seen: who is pushed.
+        tokens: the set of tokens.
+        seen: the pushed tokens.
         begins: (n, N, 2) where the finger comes down, in the token's frame.
-        ends: (n, N, 2) where it goes to.
-        moved: (n, N, 3) where the token would go if it were alone.
+        ends: (n, N, 2) where the finger stops, in the token's frame.
+        moved: (n, N, 3) how the token would move if it were alone.
     """
     pose = seen.pose[:, None].expand(*moved.shape)
     first, last = (rotated(at, pose[..., 2]) + pose[..., :2] for at in (begins, ends))
@@ -157,7 +157,7 @@ def pushes(
         gap(tokens.laid(placed_at(pose, moved / 2.0), which)[..., None], others),
     ]
     room = torch.stack(near)
-    for some in (seen.placed, ~seen.placed):  # to hit a token in its place is worse
+    for some in (seen.placed, ~seen.placed):  # hitting a token in its place is worse
         least = torch.where(some[:, None], room, _NEAR).amin(-1).movedim(0, -1)
         parts.append(least.clamp(-_NEAR, _NEAR) / _NEAR)
     blocked = distance(others, first).amin(-1) < tokens.finger

@@ -1,4 +1,4 @@
-"""Acting on whole scenes.
+"""The actor on whole scenes.
 
 Legend: B environments.
 """
@@ -21,27 +21,27 @@ from tangram_tasks.played import closed
 
 
 class Decision(nn.Module):
-    """Actions (B, A) of the task's fields, by name, exploration off."""
+    """Network from the task's fields, by name, to actions (B, A) without exploration."""
 
     def __init__(self, task: Place, network: nn.Module) -> None:
         super().__init__()
         self._task, self.network = task, network
 
     def forward(self, seen: Mapping[str, Tensor]) -> Tensor:
-        """Of fields (B, ...), as `Place.spec` names them."""
+        """Actions (B, A) for fields (B, ...) with the names of `Place.spec`."""
         scenes = whole(seen)
         return as_actions(scenes.token, None, self.network(scenes)[0], self._task)
 
 
 class SceneActor(NetworkActor):
-    """The next token in the set's order, by the actor's velocity."""
+    """Moves the next token in the set's order by the velocity of the actor network."""
 
     def __init__(self, task: Place, config: SceneConfig, network: ActorNet) -> None:
         super().__init__(network)
         self._task, self._config = task, config
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
-        """Actions (B, A), with Gaussian noise and a share of them uniform where it explores."""
+        """Actions (B, A); while exploring, with Gaussian noise and a share of them uniform."""
         shown = {"placed": closed(seen), "corners": seen["corners"], "goals": seen["goals"]}
         with torch.inference_mode():
             scenes = whole({name: tensor(array) for name, array in shown.items()})
@@ -51,7 +51,7 @@ class SceneActor(NetworkActor):
             return np.asarray(as_actions(scenes.token, None, velocity, self._task).numpy())
 
     def graph(self) -> "Decision":
-        """The actor itself."""
+        """The actor network, from fields to actions."""
         return Decision(self._task, self.network)
 
     def _explored(self, velocity: Singles, raw: Singles, explore: Generators) -> Singles:

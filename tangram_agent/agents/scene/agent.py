@@ -19,40 +19,44 @@ if TYPE_CHECKING:  # need torch
 
 @dataclass(frozen=True)
 class SceneConfig(ActorCriticConfig, section="agent"):
-    """DDPG and hindsight on whole scenes, with what the paper leaves open."""
+    """Settings of DDPG with hindsight on whole scenes, and of what the paper leaves open."""
 
     flags: bool = setting(
         True,
-        "whether networks are told which tokens are placed; no: attention is told that all are, a "
-        "perceptron sees coordinates alone",
+        "whether networks see which tokens are placed; false: attention sees all as placed, a "
+        "perceptron sees only coordinates",
         part=NETWORK,
     )
     actor_tanh: int = setting(
         1, "times that tanh is applied to the actor's output", low=1, high=2, part=NETWORK
     )
-    critic_tanh: bool = setting(False, "whether it is applied to the critic's, too", part=NETWORK)
-    noise_inside: bool = setting(
-        False, "exploration noise is added before the last tanh, not after it", part=LEARNING
+    critic_tanh: bool = setting(
+        False, "whether tanh is applied to the critic's output", part=NETWORK
     )
-    actor_delay: int = setting(1, "updates for each one of the actor", low=1, part=LEARNING)
+    noise_inside: bool = setting(
+        False, "whether exploration noise is added before the last tanh, not after", part=LEARNING
+    )
+    actor_delay: int = setting(
+        1, "updates of the critic for each update of the actor", low=1, part=LEARNING
+    )
 
 
 @dataclass(frozen=True)
 class Scene(TokenAgent):
-    """One velocity for the next token, one value of the whole scene."""
+    """The paper's agent: a velocity for the next token, and a value of the whole scene."""
 
     sections: ClassVar = {"agent": SceneConfig, "net": NetConfig}
 
     config: SceneConfig
 
     def check(self, task: Task) -> None:
-        """It plays tokens whose target is seen; of several it must be told which are placed."""
+        """Refuse tasks that hide the pieces, and several tokens without `flags`."""
         place = seen_tokens(task, "scene")
         super().check(task)
         if place.layout.tokens > 1 and not self.config.flags:
             raise ConfigError(
-                f"agent.flags=false with {place.layout.tokens} tokens tells nobody which one is to "
-                "move: set agent.flags=true"
+                f"agent.flags=false with {place.layout.tokens} tokens hides from networks which "
+                "one is to move: set agent.flags=true"
             )
 
     def actor(self, task: Task) -> "SceneActor":
@@ -63,7 +67,7 @@ class Scene(TokenAgent):
         return SceneActor(place, self.config, self.networks(place.layout)[0])
 
     def networks(self, layout: "Layout") -> "tuple[ActorNet, CriticNet]":
-        """Actor and critic, with whatever weights; another kind of them overrides this."""
+        """Actor and critic before their weights are set; subclasses may return other ones."""
         from tangram_agent.agents.scene.networks import ActorNet, CriticNet  # noqa: PLC0415
         from tangram_agent.agents.scene.scenes import SceneGraph  # noqa: PLC0415
 
@@ -72,7 +76,7 @@ class Scene(TokenAgent):
         return actor, CriticNet(graph, self.net, tanh=self.config.critic_tanh)
 
     def learns(self) -> "type[SceneLearner]":
-        """With actor and critic."""
+        """The learner's class."""
         from tangram_agent.agents.scene.learner import SceneLearner  # noqa: PLC0415
 
         return SceneLearner

@@ -1,4 +1,4 @@
-"""Learning on whole scenes, as the paper has it."""
+"""The learner on whole scenes, as in the paper."""
 
 import numpy as np
 from torch import Tensor
@@ -14,7 +14,7 @@ from tangram_tasks.place import Place
 
 
 class SceneLearner(Ddpg):
-    """The paper's actor and critic."""
+    """DDPG learner of the paper's actor and critic."""
 
     actor: ActorNet
 
@@ -26,7 +26,7 @@ class SceneLearner(Ddpg):
         super().__init__(task, agent.config, (actor, critic, actor), seed, device, compiled)
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:  # noqa: ARG002
-        """Scenes of a batch."""
+        """The batch as whole scenes."""
         tokens = self.task.layout.tokens
         state, placed = self.tensor(batch.state), self.tensor(batch.placed)
         goal, action = self.tensor(batch.goal), self.tensor(batch.action)
@@ -46,5 +46,5 @@ class SceneLearner(Ddpg):
         )
 
     def features(self, steps: Steps) -> Tensor | None:
-        """Of a whole scene as it stands: one token is asked for where it was moved."""
+        """Node features that actor and critic share, if they see the same scenes."""
         return self.actor.head.see(steps.view) if steps.start is steps.view else None

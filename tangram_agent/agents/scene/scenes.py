@@ -1,4 +1,4 @@
-"""Whole scenes: all tokens and the whole target in one graph, as the paper has it (Sec. IV-A)."""
+"""Whole scenes: all tokens and the whole target in one graph, as in the paper (Sec. IV-A)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,18 +28,18 @@ class Scenes:
 
 
 def next_token(placed: Tensor) -> Tensor:
-    """Which token moves, (B,): the first that is not placed (B, K); 0 where all are."""
+    """Index (B,) of the token that moves: the first not placed (B, K); 0 if all are placed."""
     return (placed == 0).int().argmax(dim=-1)
 
 
 def whole(seen: Mapping[str, Tensor]) -> Scenes:
-    """The scenes of a task's fields (B, ...), by name; the next token is to move."""
+    """Scenes from a task's fields (B, ...), by name; the next token is to move."""
     placed = closed(seen)
     return Scenes(seen["corners"], placed, seen["goals"], next_token(placed))
 
 
 class SceneGraph(nn.Module):
-    """The graph of Sec. IV-A: four features a node, in the arena's coordinates.
+    """The graph of Sec. IV-A, with four features for each node, in the arena's coordinates.
 
     The edges are a constant of the layout (`adjacency`, (N, N)); only features depend on the state.
     """
@@ -50,7 +50,7 @@ class SceneGraph(nn.Module):
     target_flag: Tensor
 
     def __init__(self, layout: Layout, flags: bool = True) -> None:
-        """Without flags of what is placed all nodes carry a 1, and vectors are positions alone."""
+        """Make the constants; without `flags` all tokens look placed, and `vectors` omits flags."""
         super().__init__()
         self.tokens, self.corners, self.nodes = layout.tokens, layout.corner_count, layout.nodes
         self.features, self.flags = 4, flags
@@ -71,7 +71,7 @@ class SceneGraph(nn.Module):
         return self.corners + scenes.token
 
     def node_features(self, scenes: Scenes) -> Tensor:
-        """Features (M, N, F): position, whether it is the target's, whether it is placed."""
+        """Features (M, N, F): position, 1 for nodes of the target, 1 for nodes of placed tokens."""
         corners, goal = scenes.corners, scenes.goal
         positions = torch.cat([corners, self.base_weights @ corners, goal], dim=1)
         placed = scenes.placed if self.flags else torch.ones_like(scenes.placed)
@@ -81,6 +81,6 @@ class SceneGraph(nn.Module):
         return torch.cat([positions, torch.stack([target, flags], dim=-1)], dim=-1)
 
     def vectors(self, scenes: Scenes) -> Tensor:
-        """(M, inputs): the features of all nodes in one row."""
+        """Inputs (M, inputs) of a perceptron: the features of all nodes in one row."""
         features = self.node_features(scenes)
         return (features if self.flags else features[..., :2]).flatten(1)

@@ -1,4 +1,4 @@
-"""Rates, each measured in turns with something else: learner, workers, whole trainings.
+"""Rates of learner, workers and whole trainings, each measured in turns with an alternative.
 
-Start with `learner.py`. `fetch.py` trains beside Stable-Baselines3.
+Start with `learner.py`. `fetch.py` compares trainings with Stable-Baselines3.
 """

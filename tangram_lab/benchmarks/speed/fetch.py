@@ -1,8 +1,9 @@
 """Our goal agent and Stable-Baselines3's TD3 with hindsight, side by side on Fetch and Panda.
 
-Each has half of the cores, at the same time, and the GPU where there is one. Inputs are normalised
-in both; networks, batches, pace and rates are ours in both; the rest of theirs is RL Zoo's. Its own
-sizes (3 x 512, batches of 2,048, an update a step) are no match for a few cores.
+Both train at the same time, each on half of the cores, and on the GPU if there is one. Both
+normalise inputs, and both use our network sizes, batch size, learning rate, discount and updates
+per step. Stable-Baselines3 has its other settings from RL Zoo. RL Zoo's own sizes (3 x 512, batches
+of 2,048, one update per step) would be too slow on a few cores.
 """
 
 import importlib
@@ -51,12 +52,14 @@ Curve = list[tuple[float, int, int, float]]
 
 @dataclass(frozen=True)
 class Match:
-    """One training of each.
+    """One training of each side.
 
     Attributes:
-        id: of the environment.
+        id: gymnasium id of the environment.
+        seed: seed of both trainings.
+        minutes: length of each training.
         agent: our preset.
-        workers: of ours; 0 for as many as its cores, two at least.
+        workers: number of our workers; 0: one fewer than its cores, but at least two.
     """
 
     id: str
@@ -67,26 +70,26 @@ class Match:
 
     @property
     def module(self) -> str:
-        """That registers the environment."""
+        """Name of the Python module that registers the environment."""
         return "panda_gym" if self.id.startswith("Panda") else "gymnasium_robotics"
 
 
 def label() -> str:
-    """The library's name and version; ModuleNotFoundError where it is missing."""
+    """Name and version of Stable-Baselines3; ModuleNotFoundError if it is missing."""
     try:
         return f"Stable-Baselines3 {version('stable-baselines3')}"
     except PackageNotFoundError:
         raise ModuleNotFoundError(
-            "Stable-Baselines3, which this compares with, is missing: pip install stable-baselines3"
+            "this benchmark needs Stable-Baselines3: pip install stable-baselines3"
         ) from None
 
 
 def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
-    """Train what `rows` has no results of, each match after the other; the table of all.
+    """Run the matches that are not in `rows` yet, one after the other; return a table of all.
 
     Args:
-        matches: what to train.
-        rows: CSV file that gets every test as soon as a match is over, beside a picture of all.
+        matches: the trainings to compare.
+        rows: CSV file; after each match its tests are added, and a picture beside it is redrawn.
 
     Raises:
         ConfigError: `rows` has other columns.
@@ -101,7 +104,7 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
     for match in matches:
         key = asdict(match)
         if not _of(there, match).empty:
-            print(f"{match.id}, seed {match.seed}: is in {rows}", file=sys.stderr)
+            print(f"{match.id}, seed {match.seed}: already in {rows}", file=sys.stderr)
             continue
         ours, theirs = _play(match, name)
         pairs = zip_longest(ours, theirs, fillvalue=[math.nan] * len(COLUMNS))
@@ -117,7 +120,7 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
 
 
 def draw(table: pd.DataFrame, name: str, path: Path) -> None:
-    """Success against minutes, a panel for each environment, a line for each training."""
+    """Plot success by minutes into a PNG, a panel per environment and a line per training."""
     ids, rest = list(dict.fromkeys(table["id"])), [one.name for one in fields(Match)][1:]
     figure, panels = new_figure(2.6, len(ids), sharey=True)
     for id, panel in zip(ids, panels, strict=True):  # noqa: A001
@@ -142,7 +145,9 @@ def _read(rows: Path | None) -> pd.DataFrame:
         return pd.DataFrame(columns=_columns())
     found = pd.read_csv(rows)
     if list(found) != _columns():
-        raise ConfigError(f"rows={rows} has other columns than {', '.join(_columns())}")
+        raise ConfigError(
+            f"rows={rows} has other columns than {', '.join(_columns())}: name another file"
+        )
     return found
 
 
@@ -175,7 +180,7 @@ def _rows(match: Match, table: pd.DataFrame, name: str) -> list[Row]:
 
 
 def _play(match: Match, name: str) -> tuple[Curve, Curve]:
-    """Both trainings at once."""
+    """Run both trainings at the same time; the learning curves of ours and theirs."""
     cores = sorted(os.sched_getaffinity(0))
     half = max(1, len(cores) // 2)
     given = json.dumps({**asdict(match), "cores": cores[half:] or cores})
@@ -203,7 +208,7 @@ def _agent(match: Match) -> list[str]:
 
 
 def _ours(match: Match, folder: Path, cores: list[int]) -> Curve:
-    """Our training, on its cores; workers and master take turns where there are fewer."""
+    """Run our training on its cores; if there are few, master and workers share them."""
     settings = (
         *("task=gym", f"task.id={match.id}", f"task.imports=[{match.module}]"),
         *_agent(match),
@@ -231,7 +236,7 @@ def _ours(match: Match, folder: Path, cores: list[int]) -> Curve:
 
 
 def train(match: Match, cores: Sequence[int]) -> None:
-    """Train, and print each test; what they take does not count."""
+    """Train Stable-Baselines3, and print each test; the time of tests does not count."""
     library = importlib.import_module(LIBRARY)
     vector, alone = importlib.import_module(f"{LIBRARY}.common.vec_env"), len(cores) == 1
     noise = importlib.import_module(f"{LIBRARY}.common.noise")

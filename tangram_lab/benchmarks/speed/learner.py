@@ -1,4 +1,4 @@
-"""Updates: compiled, and on a GPU."""
+"""Speed of learner updates: compiled, on one core and on a GPU."""
 
 import importlib
 from functools import partial
@@ -32,8 +32,8 @@ HIDDEN, SIZE, EPISODES = [256, 256, 256], 256, 320
 
 
 def measure_learner(runs: int) -> list[Row]:
-    """Updates per second on one core, compiled, against single operations that do the same."""
-    name = label()  # what the goal agent is compared with is missed at once
+    """Updates per second on one core, compiled, compared with uncompiled single operations."""
+    name = label()  # fail at once, not after minutes, if Stable-Baselines3 is missing
     cases = [("perceptron [64, 64]", preset("mlp"), 256, 2.3)]
     cases += [("ours", preset(), size, 1.5) for size in BATCHES]
     cases += [("ours, 7 tokens", several(7), BATCHES[0], 1.5)]
@@ -47,7 +47,7 @@ def measure_learner(runs: int) -> list[Row]:
 
 
 def _goal_rows(runs: int, name: str) -> list[Row]:
-    """The goal agent with what it draws, beside Stable-Baselines3 and what the core can do."""
+    """The goal agent with its sampling, compared with Stable-Baselines3 and the peak of a core."""
     case = f"goal agent {HIDDEN}, batch {SIZE}"
     sizes = f"agent.hidden={HIDDEN}", f"agent.batch_size={SIZE}"
     setup = robot(still.ID, still.__name__, "agent=goal", *sizes)
@@ -73,7 +73,7 @@ def _goal_rows(runs: int, name: str) -> list[Row]:
 
 
 def goal_updates(setup: Setup, *, compiled: bool = False) -> Work:
-    """Updates with all that is drawn for them."""
+    """Work of the goal agent: updates with sampling from its replay buffer."""
     made = setup.agent.learner(setup.task, 0, "cpu", compiled=compiled)
     rng = {stream: np.random.default_rng(i) for i, stream in enumerate(made.streams)}
     made.insert(played(setup, EPISODES), rng)
@@ -82,14 +82,14 @@ def goal_updates(setup: Setup, *, compiled: bool = False) -> Work:
         made.update(0.0, rng)
         return 1
 
-    for _ in range(goal_config(setup).actor_delay):  # with the actor and without: both forms
+    for _ in range(goal_config(setup).actor_delay):  # compile both forms, with and without actor
         work()
 
     return work
 
 
 def goal_flops(setup: Setup) -> float:
-    """Of the matrix products in TD3's update, the actor's share of those in which it learns."""
+    """Floating-point operations of the matrix products in a TD3 update, averaged over updates."""
     config = goal_config(setup)
     made: Any = setup.agent.learner(setup.task, 0, "cpu")
     inner = sum(a * b for a, b in pairwise(config.hidden))
@@ -98,14 +98,14 @@ def goal_flops(setup: Setup) -> float:
         return 2 * (inputs * config.hidden[0] + inner + config.hidden[-1] * outputs)
 
     critic, actor = layers(made.size + made.actions, 1), layers(made.size, made.actions)
-    # Forward is one, backward two more; targets go forward only, and the actor asks for no gradient
-    # of the critic's weights.
+    # A forward pass counts once, a backward pass twice. Target networks have no backward pass, and
+    # the actor's loss needs no gradient of the critic's weights.
     critics = 2 * critic * 3 + 2 * critic + actor
     return float(config.batch_size) * (critics + (3 * actor + 2 * critic) / config.actor_delay)
 
 
 def sb3_updates(setup: Setup) -> Work:
-    """Stable-Baselines3's TD3 with hindsight, of the same sizes."""
+    """Work of Stable-Baselines3's TD3 with hindsight, with the same sizes."""
     config = goal_config(setup)
     library: Any = importlib.import_module("stable_baselines3")
     model = library.TD3(
@@ -129,13 +129,13 @@ def sb3_updates(setup: Setup) -> Work:
 
 
 def measure_gpu(runs: int) -> list[Row]:
-    """Updates per second on a GPU: recorded, compiled, and against one core, compiled.
+    """Updates per second on a GPU, recorded as a CUDA graph, compared with three alternatives.
 
     Raises:
-        ConfigError: there is no GPU.
+        ConfigError: no GPU is visible.
     """
     if not torch.cuda.is_available():
-        raise ConfigError("gpu needs a GPU, and none is visible: see tangram-bench learner")
+        raise ConfigError("gpu needs a GPU, and none is visible: use tangram-bench learner")
     rows = []
     for name, made in gpu_cases().items():
         single = learner(made, "cuda")
@@ -153,7 +153,7 @@ def measure_gpu(runs: int) -> list[Row]:
 
 
 def gpu_cases() -> dict[str, Setup]:
-    """What is measured on a GPU, from small to large."""
+    """Name -> setup of the measurements on a GPU, from small to large."""
     named = [("perceptron [64, 64]", preset("mlp"), 256), ("paper's MHA", preset("paper"), 64)]
     named += [("ours, 7 tokens", several(7), BATCHES[0])]
     named += [("ours", preset(), size) for size in (*BATCHES, 2048)]
@@ -163,16 +163,16 @@ def gpu_cases() -> dict[str, Setup]:
 
 
 def learner(setup: Setup, device: str = "cpu", *, compiled: bool = False) -> Ddpg:
-    """What learns in a setup."""
+    """A new learner of a setup."""
     return cast("Ddpg", setup.agent.learner(setup.task, 0, device, compiled=compiled))
 
 
 def updates(setup: Setup, made: Ddpg | None = None) -> Work:
-    """Updates on one batch; by single operations where no learner is given."""
+    """Work of updates on one fixed batch; without `made`, by an uncompiled learner."""
     own, generator = made or learner(setup), np.random.default_rng(0)
     batch = random_transitions(setup, own.config.batch_size)
     steps = partial(own.steps, batch, generator)
-    if isinstance(own, PairLearner):  # pairs are made before; that they become tensors counts
+    if isinstance(own, PairLearner):  # making pairs is not measured; making tensors of them is
         pairs = make_pairs(batch, own.task.layout, own.config.hindsight, generator)
         steps = partial(own.steps_of, pairs)
 

@@ -1,4 +1,4 @@
-"""Synthetic players: many real Clients in one process, which send what was played before."""
+"""Synthetic players: many real Clients in one process, which send ready-made episodes."""
 
 import time
 from collections.abc import Iterator
@@ -10,12 +10,12 @@ from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from worker.talk.client import Client
 
-PAUSE_S = 0.002  # between two rounds over all clients, or as long as a round took
+PAUSE_S = 0.002  # shortest pause between two rounds over all clients
 
 
 @contextmanager
 def players(connect: Path, setup: Setup, episodes: Episodes, count: int) -> Iterator[int]:
-    """So many players in a process of their own; its id. It is ended at the end."""
+    """Run `count` players in one process inside this context; yield the id of the process."""
     arguments = (str(connect), setup, episodes, count)
     process = get_context("spawn").Process(target=play, args=arguments, daemon=True)
     process.start()
@@ -28,7 +28,7 @@ def players(connect: Path, setup: Setup, episodes: Episodes, count: int) -> Iter
 
 
 def play(connect: str, setup: Setup, episodes: Episodes, count: int) -> None:
-    """Let all players send whatever their windows take, until the master sends them home."""
+    """Send `episodes` from all players whenever there is room, until the master stops them."""
     spec, versions = setup.spec, dict[int, int]()
     with ExitStack() as stack:
         clients = [
@@ -44,5 +44,5 @@ def play(connect: str, setup: Setup, episodes: Episodes, count: int) -> None:
                     versions[player] = weights.version
                 if player in versions and client.window_free and not client.stopped:
                     client.send(episodes, versions[player])
-            # Many share few cores with the master: they leave it half of one.
+            # The players share few cores with the master, so they rest half of the time.
             time.sleep(max(PAUSE_S, time.monotonic() - begin))

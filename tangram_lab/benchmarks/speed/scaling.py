@@ -1,7 +1,7 @@
-"""More workers: real ones in miniature trainings, and up to 1,000 synthetic ones of one master.
+"""Scaling with workers: real ones in small trainings, and up to 1,000 synthetic ones.
 
-Two runs that are compared are alive at one time; while one is measured, the processes of the other
-are stopped. So what else the machine does meets both.
+The two runs of a comparison exist at the same time. While one is measured, the processes of the
+other are stopped, so other load on the machine affects both alike.
 """
 
 import os
@@ -20,17 +20,17 @@ from tangram_lab.benchmarks.speed.players import players
 from tangram_lab.benchmarks.trainings import numbers_of, processes_of, start_training, wait_for
 
 STAGE = "scaling"
-CORES = 8  # below which two workers share cores with the rest
+CORES = 8  # with fewer, two workers share cores with other processes
 LINEAR = Bound(least=0.9)
 SAME = Bound(least=0.9)
 SYNTHETIC = 64, 1000
 BATCH = 32
 PUBLISH_S = 0.5
-SETTLE_S = 2.0  # a broadcast at least: one is due where a stopped run goes on
-SPAN_S = 6.0  # longer than it takes to the next one
+SETTLE_S = 2.0  # lets the broadcast pass that is due when a stopped run continues
+SPAN_S = 6.0  # longer than the interval between two broadcasts
 PATIENCE_S = 120.0
 ENDLESS = ("max_updates=0", "service.checkpoint_minutes=60", "service.http_port=-1")
-# Play is slow, learning is next to nothing, and the evaluator rests.
+# Play is the slow part, learning takes almost no time, and the evaluator rests.
 PLAYING = (
     *ENDLESS,
     "task=push",
@@ -44,25 +44,25 @@ PLAYING = (
 
 @dataclass
 class Run:
-    """A run that is stopped unless it is measured.
+    """A run whose processes are stopped except during a measurement.
 
     Attributes:
-        folder: of the run.
-        more: processes beside those that name the folder.
+        folder: run folder.
+        more: ids of further processes, whose command lines do not contain the folder.
     """
 
     folder: Path
     more: list[int] = field(default_factory=list)
 
     def signal(self, number: signal.Signals) -> None:
-        """To all processes of the run."""
+        """Send a signal to all processes of the run."""
         pids = (process.pid for process in processes_of(self.folder))
         for pid in (*pids, *self.more):
             os.kill(pid, number)
 
     @contextmanager
     def awake(self) -> Iterator[None]:
-        """Let the stopped processes run while inside."""
+        """Let the stopped processes run inside this context."""
         self.signal(signal.SIGCONT)
         try:
             yield
@@ -70,23 +70,23 @@ class Run:
             self.signal(signal.SIGSTOP)
 
     def numbers(self) -> dict[str, float]:
-        """The status of the master; it is a second old at most."""
+        """Name -> number in the status of the master, at most a second old."""
         return numbers_of(self.folder, PATIENCE_S)
 
     def cpu_s(self) -> float:
-        """CPU time of the processes that name the folder."""
+        """CPU seconds of the processes whose command lines contain the folder."""
         spent = (process.cpu_times() for process in processes_of(self.folder))
         return float(sum(one.user + one.system for one in spent))
 
     def master_size(self) -> tuple[float, float]:
-        """Its resident memory in MiB, and how many descriptors it has open."""
+        """Resident memory of the master in MiB, and its number of open file descriptors."""
         (master,) = processes_of(self.folder)
         return master.memory_info().rss / 2**20, float(master.num_fds())
 
     def rates(self, *names: str) -> dict[str, float]:
-        """By how much some numbers grow in a second, and CPU seconds as "cpu"."""
+        """Growth of some numbers per second, and CPU seconds per second as "cpu"."""
         with self.awake():
-            # Who was stopped for long is let in anew.
+            # Workers that were stopped for long must join again first.
             episodes = self.numbers()["episodes"]
             self.wait(lambda now: now["episodes"] > episodes)
             time.sleep(SETTLE_S)
@@ -99,16 +99,16 @@ class Run:
         return {**grown, "cpu": spent / (end - begin)}
 
     def wait(self, ready: Callable[[dict[str, float]], bool]) -> None:
-        """Wait until its numbers say so."""
+        """Wait until `ready` is true for the numbers of the status; TangramError if too late."""
         until = time.monotonic() + PATIENCE_S
         while not ready(self.numbers()):
             if time.monotonic() > until:
-                raise TangramError(f"the run in {self.folder} does not get under way")
+                raise TangramError(f"the run in {self.folder} makes no progress: see its file told")
             time.sleep(0.5)
 
 
 def measure_scaling(runs: int) -> list[Row]:
-    """Real workers, and synthetic ones."""
+    """Measure real workers, and synthetic ones; rows of the table."""
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         real = list(_real(runs, Path(folder)))
         fed = [row for count in SYNTHETIC for row in _synthetic(runs, Path(folder), count)]
@@ -116,7 +116,7 @@ def measure_scaling(runs: int) -> list[Row]:
 
 
 def _real(runs: int, folder: Path) -> Iterator[Row]:
-    """Episodes/s of two workers against one."""
+    """Episodes per second of two workers, compared with one."""
     with ExitStack() as stack:
         alone, both = (
             stack.enter_context(_training(folder / f"workers_{n}", n, f"workers={n}", *PLAYING))
@@ -131,7 +131,7 @@ def _real(runs: int, folder: Path) -> Iterator[Row]:
 
 
 def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
-    """A master that learns, with so many players and with one."""
+    """Rates and size of a learning master with `count` players, compared with one player."""
     names = ("updates", "hub/batches", "hub/published")
     with ExitStack() as stack:
         one, many = (
@@ -147,7 +147,7 @@ def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
     ):
         ours, theirs = [m[name] for m, _ in found], [o[name] for _, o in found]
         yield compared((STAGE, case, unit), ours, against, theirs, bound)
-    # What the rest of a busy machine takes from one run more than from the other is left out.
+    # Per CPU second, so that load of other programs during one of the runs does not count.
     ours, theirs = (
         [run["updates"] / run["cpu"] for run in both] for both in zip(*found, strict=True)
     )
@@ -158,7 +158,7 @@ def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
 
 @contextmanager
 def _training(folder: Path, count: int, *settings: str, name: str = "train") -> Iterator[Run]:
-    """A training or a master with so many players, stopped once all of them have played."""
+    """Run a training or a master; a training is stopped once all `count` players have joined."""
     process = start_training(folder, *settings, name=name)
     run = Run(folder)
     try:
@@ -179,7 +179,7 @@ def _settle(run: Run, count: int) -> None:
 
 @contextmanager
 def _fed(folder: Path, count: int) -> Iterator[Run]:
-    """A master of its own with so many synthetic players."""
+    """Run a master with `count` synthetic players."""
     setup = preset()
     settings = (*ENDLESS, f"service.publish_seconds={PUBLISH_S}")
     connect = folder / "connection.json"

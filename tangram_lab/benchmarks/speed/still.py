@@ -1,4 +1,4 @@
-"""A goal environment of Fetch's sizes that costs nothing to play, so that learning is measured."""
+"""A goal environment with the shapes of Fetch and almost no cost, to measure learning alone."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ ID, STEPS, NEAR = "TangramStill-v0", 50, 0.05
 
 
 class Still(gymnasium.Env[Any, Any]):
-    """Where each step leads is drawn; 25 numbers are observed, a goal has 3, an action 4."""
+    """Every step leads to a random state: 25 numbers observed, 3 in a goal, 4 in an action."""
 
     def __init__(self, **_: Any) -> None:
         def box(size: int, most: float) -> spaces.Box:
@@ -27,23 +27,23 @@ class Still(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Arrays, dict[str, Any]]:
-        """A goal is drawn."""
+        """Draw a random desired goal and a random state."""
         super().reset(seed=seed, options=options)
         self._goal = self._drawn(3)
         return self._seen(), {}
 
     def step(self, action: Array) -> tuple[Arrays, float, bool, bool, dict[str, Any]]:  # noqa: ARG002
-        """Anywhere."""
+        """Go to a random state, whatever the action is."""
         seen = self._seen()
         reward = float(self.compute_reward(seen["achieved_goal"], self._goal, {}))
         return seen, reward, False, False, {"is_success": reward == 0.0}
 
     def compute_reward(self, achieved: Array, desired: Array, info: Any) -> Any:  # noqa: ARG002
-        """0 near the goal, else -1, as Fetch has it."""
+        """Reward as in Fetch: 0 within NEAR of the desired goal, else -1."""
         return -(np.linalg.norm(achieved - desired, axis=-1) > NEAR).astype(np.float32)
 
     def compute_terminated(self, achieved: Array, desired: Array, info: Any) -> bool:  # noqa: ARG002
-        """Never."""
+        """False: an episode never terminates early."""
         return False
 
     def _seen(self) -> Arrays:

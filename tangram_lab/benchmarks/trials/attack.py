@@ -1,4 +1,4 @@
-"""Every attack of the security review, on trainings; what held, and what was seen."""
+"""Runs all attacks of the security review on real trainings, and reports the outcome."""
 
 import resource
 import signal
@@ -26,19 +26,19 @@ from tangram_lab.benchmarks.trials.target import (
     until,
 )
 
-OPEN = ("max_updates=0", "service.bind=127.0.0.1", *OURS)  # until it was attacked enough
-NOISE = 0.02  # of the mean reward, between two trainings of so many updates
-UPDATES, LAG = 200, 100  # before the attacks begin
+OPEN = ("max_updates=0", "service.bind=127.0.0.1", *OURS)  # without end, on a port
+NOISE = 0.02  # of the mean reward, between two undisturbed trainings of this length
+UPDATES, LAG = 200, 100  # attacks begin after so many updates, when the learner lags by less
 
 
 def ends_in_order() -> None:
-    """From now on SIGTERM ends what this process has started, as Ctrl-C does."""
+    """Make SIGTERM end this process and its children in order, as Ctrl-C does."""
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
 
 @contextmanager
 def beside() -> Iterator[ProcessPoolExecutor]:
-    """A process for what may be done meanwhile; it is gone after the block."""
+    """A pool of one process for parallel work; all child processes end with this context."""
     with ProcessPoolExecutor(1, get_context("spawn"), ends_in_order) as pool:
         try:
             yield pool
@@ -48,12 +48,12 @@ def beside() -> Iterator[ProcessPoolExecutor]:
 
 
 def on_a_port() -> str:
-    """A setting: the same one after each restart."""
+    """A setting for a free port, which the master keeps after each restart."""
     return f"service.port={free_port()}"
 
 
 def wait_for_updates(most: int, folder: Path, launcher: "subprocess.Popen[bytes]") -> None:
-    """Wait until a training has done so many, or ended."""
+    """Wait until a training has done `most` updates, or has ended."""
     updates = 0.0
     while updates < most and launcher.poll() is None:
         time.sleep(LOOK_S)
@@ -62,14 +62,14 @@ def wait_for_updates(most: int, folder: Path, launcher: "subprocess.Popen[bytes]
 
 
 def run_attack(out: Path | None, folder: Path) -> int:
-    """Attack one training, harm others, and compare the score with that of an undisturbed one.
+    """Run all attacks, and compare the score of the attacked training with an undisturbed one.
 
     Args:
-        out: JSON file.
-        folder: for the runs; must not hold any.
+        out: JSON file for the results; None writes none.
+        folder: folder for the runs, without any runs yet.
 
     Returns:
-        0 if all held and the score is no worse, else 1.
+        0 if every attack held and the score is no worse, else 1.
     """
     begun = time.monotonic()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -79,7 +79,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
         with training(live, *OPEN, on_a_port(), "service.log_format=json", OFTEN) as target:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
             target.goes_on(UPDATES, "updates")
-            until(lambda: target.numbers()["lag_updates"] < LAG)  # from what it began with
+            until(lambda: target.numbers()["lag_updates"] < LAG)  # the lag of the start is gone
             rows = list(tried(BESIEGED, target))
             meanwhile = pool.submit(harmed, folder)
             undisturbed = others.enter_context(started(straight, "max_updates=0", *OURS))
@@ -87,7 +87,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         result = result_of(live)
         with training(folder / "shared", *OPEN, on_a_port()) as target:
-            rows += tried(NEIGHBOURS, target)  # nobody asks for its score: they send what they like
+            rows += tried(NEIGHBOURS, target)  # forged episodes here cannot spoil the score
         rows += meanwhile.result()
         wait_for_updates(result["updates"], straight, undisturbed)
     other = result_of(straight)

@@ -1,6 +1,7 @@
-"""Attacks on a training that listens on a port, with keys; each says whether it held and why.
+"""Attacks on a training that listens on a port with authentication.
 
-Everything goes to 127.0.0.1 or to unix sockets of this machine, bounded in count and in time.
+Each returns whether the training held, and what was observed. All traffic goes to 127.0.0.1 or to
+unix sockets of this machine, and is bounded in count and time.
 """
 
 import json
@@ -41,23 +42,23 @@ from tangram_lab.benchmarks.trials.target import (
 from worker.talk.client import Client
 from worker.talk.connection import Timing
 
-ROOM_FILES = 300  # the same of its open files, under strangers
-OPEN_FILES = 1024  # that a master may begin with
+ROOM_FILES = 300  # allowed growth of the master's open files while strangers connect
+OPEN_FILES = 1024  # limit of open files at the start of the master
 
 
 def lasting(seconds: float, step: Callable[[], object], pause_s: float = 0.001) -> None:
-    """Do something again and again for so long."""
+    """Repeat `step` for some seconds."""
     until_s = time.monotonic() + seconds
     while time.monotonic() < until_s:
         step()
         time.sleep(pause_s)
 
 
-# Those who have the keys
+# Attackers with the keys
 
 
 def huge_incarnations(target: Target) -> Seen:
-    """And then the next process of the same index: the number after the largest."""
+    """Send HELLO with the largest incarnations, then join with the next process of that index."""
 
     def join() -> None:
         for huge in (2**63 - 1, MAX_COUNT):
@@ -72,15 +73,15 @@ def huge_incarnations(target: Target) -> Seen:
 
 
 def large_topic(target: Target) -> Seen:
-    """Row 4: by one without keys, and in parts by those who have them.
+    """Subscribe to a huge topic without keys, and to many large topics with keys.
 
-    ZeroMQ's own end of a longer topic overflows its stack.
+    ZeroMQ itself overflows its stack with still longer topics.
     """
 
     def topics() -> None:
         subscribe(target.where["weights_endpoint"], 16 * MIB)
         with ExitStack() as opened:
-            for number in range(64):  # those that are equal would be kept once
+            for number in range(64):  # all different, because equal topics are stored once
                 one = opened.enter_context(target.peer(zmq.SUB))
                 one.setsockopt(zmq.SUBSCRIBE, bytes([number]) * 32 * 1024)
             time.sleep(2.0)
@@ -102,7 +103,7 @@ def unread_weights(target: Target) -> Seen:
 
 
 def many_incarnations(target: Target) -> Seen:
-    """Of one index, and of as many; nobody has sent a batch, so a checkpoint has none of them."""
+    """Join 4,096 processes with one index, then 4,096 others; checkpoints must not keep them."""
 
     def join() -> None:
         with target.peer() as one:
@@ -120,7 +121,7 @@ def many_incarnations(target: Target) -> Seen:
 
 
 def million_frames(target: Target) -> Seen:
-    """It is refused when all of it has come, which takes seconds."""
+    """Send one message of a million frames; it is refused once it has arrived, after seconds."""
     refused: list[int] = []
 
     def send() -> None:
@@ -181,7 +182,7 @@ def deaf_subscribers(target: Target) -> Seen:
 
 
 def degenerate_batches(target: Target) -> Seen:
-    """Each is the next one of its sender, so that it would be taken if it were right."""
+    """Send invalid batches with correct sequence numbers; each must be refused for its content."""
     spec, episodes = target.setup.spec, episodes_of(target.setup, 4)
     frames = EpisodeBatch(1, 0, episodes).encode(spec)[1:]
     wrong = [[], frames[1:], [*frames, b""], [b"", *frames[1:]]]
@@ -199,11 +200,11 @@ def degenerate_batches(target: Target) -> Seen:
     return held and refused == len(sent), f"{refused} of {len(sent)} refused, {seen}"
 
 
-# Those who have none
+# Attackers without keys
 
 
 def besieged(target: Target, strangers: Strangers, seconds: float) -> Seen:
-    """Whether strangers cost little, and a worker that joins meanwhile is acknowledged."""
+    """Whether strangers cost the master little, and a worker can join and play meanwhile."""
     worker, master = Witness(str(target.folder), target.setup), target.master
     with target.cost() as most:
         lasting(seconds / 2, strangers.push)
@@ -232,7 +233,7 @@ def thousand_strangers(target: Target) -> Seen:
 
 
 def idle_connections(target: Target) -> Seen:
-    """By a master that began with few files, and took more."""
+    """Open more connections than OPEN_FILES; the master must have raised its own limit."""
     soft, hard = target.master.rlimit(psutil.RLIMIT_NOFILE)
     with Strangers(target.where["endpoint"], 3300) as strangers:
         held, seen = besieged(target, strangers, 4.0)
@@ -246,7 +247,7 @@ def uninvited(target: Target, role: str = "") -> Seen:
     said = (evaluator, forged, Heartbeat({}).encode())
     roles = [role] if role else ["", "unknown"]
     answers = sum((target.ask(*said, role=one) for one in roles), Counter[str]())
-    goes_on = target.goes_on()  # what was said has been looked at, and written
+    goes_on = target.goes_on()  # by now the master has handled the messages and written the curve
     curve = target.folder / "curve.jsonl"
     told = curve.read_text() if curve.exists() else ""
     forgeries = len(re.findall(r"\b0\.999\b", told))
@@ -296,7 +297,7 @@ def garbage(target: Target) -> Seen:
 
 @contextmanager
 def askers(target: Target, count: int, words: bytes) -> Iterator[list[socket.socket]]:
-    """So many connections at once to where HTTP is spoken, which have said these words."""
+    """Open `count` connections to the HTTP port, and send these bytes on each."""
     with ExitStack() as opened:
         asking = [opened.enter_context(socket.socket()) for _ in range(count)]
         for one in asking:
@@ -333,9 +334,9 @@ def slow_requests(target: Target) -> Seen:
 
 
 def asked(target: Target, words: bytes) -> Seen:
-    """What HTTP answers to something else than a question that it knows."""
+    """Send a wrong request to the HTTP port; the answer must be neither a page nor a secret."""
     with socket.create_connection(target.port("http"), 10.0) as one:
-        with suppress(OSError):  # it may hang up before it has heard all
+        with suppress(OSError):  # the server may close before it has read everything
             one.sendall(words)
             one.shutdown(socket.SHUT_WR)
         answer = b""
@@ -354,13 +355,13 @@ ODD = {
 }
 
 
-# First: what others leave behind would be room for it. And with nothing else at work: a worker
-# joins in the time that strangers leave to the master.
+# Run first, because memory freed after other attacks would hide growth. Run with nothing else at
+# work, because a worker must join in the time that strangers leave to the master.
 BESIEGED: list[Attack] = [
     ("3", "strangers with all that they may say", "1,000 at a time, 5 s", thousand_strangers),
     ("9", "idle connections", "3,300 for 4 s", idle_connections),
 ]
-LIVE: list[Attack] = [  # the largest one is the last
+LIVE: list[Attack] = [  # the attack that needs most memory is the last
     ("1", "HELLO, BYE and HELLO with the largest numbers", "12 messages", huge_incarnations),
     ("3", "frames before the handshake", "30 of 31 MiB", large_frames),
     ("4", "a topic on the weights socket", "16 MiB and 64 of 32 KiB", large_topic),

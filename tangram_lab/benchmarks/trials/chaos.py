@@ -1,4 +1,4 @@
-"""Random faults over a real training: what recovers, how fast, and whether anything is lost."""
+"""Random faults in a real training: what recovers, how fast, and whether episodes are lost."""
 
 import os
 import random
@@ -38,7 +38,7 @@ from worker.play.session import Acting
 from worker.status import ask_status
 from worker.talk.client import Client
 
-# A player that remembers every episode it sent, and what was acknowledged
+# A player that stores every episode it sent, and counts acknowledged batches
 
 
 ENVS = 4
@@ -46,13 +46,13 @@ INDEX = 1000
 
 
 class Witness(Thread):
-    """Plays until it is asked to stop, or sent home.
+    """A player thread that plays until `stop` is called or the master ends it.
 
     Attributes:
-        setup: of the run.
-        sent: episodes by batch, each known by its first state and action.
-        acknowledged: number of the last batch up to which all were acknowledged.
-        error: what ended it, if that was a failure.
+        setup: setup of the run.
+        sent: for each batch, the keys of its episodes (see `keys`).
+        acknowledged: the largest n such that batches 1 to n are all acknowledged.
+        error: the error that ended the thread; None without one.
     """
 
     def __init__(self, connect: str, setup: Setup) -> None:
@@ -64,11 +64,11 @@ class Witness(Thread):
         self._connect, self._ends = connect, Event()
 
     def stop(self) -> None:
-        """Ask it to stop."""
+        """Ask the thread to stop."""
         self._ends.set()
 
     def run(self) -> None:
-        """Play."""
+        """Play, and store an error in `error`."""
         try:
             self._play()
         except TangramError as error:
@@ -112,7 +112,7 @@ class Witness(Thread):
 
 
 def keys(states: np.ndarray, actions: np.ndarray) -> list[bytes]:
-    """Each episode by its first state and action, which no other one shares."""
+    """A key for each episode: the bytes of its first state and action, which are unique."""
     return [
         s.astype("<f4").tobytes() + a.astype("<f4").tobytes()
         for s, a in zip(states, actions, strict=True)
@@ -120,10 +120,10 @@ def keys(states: np.ndarray, actions: np.ndarray) -> list[bytes]:
 
 
 def compare(folder: Path, witness: Witness) -> dict[str, int]:
-    """What the last checkpoint of a run has of what a witness sent.
+    """Count episodes of a witness that are lost or doubled in the last checkpoint of a run.
 
-    The replay must be large enough to hold the whole run. Each episode of one action stands there
-    also relabelled, with the same state and action.
+    The replay buffer must be large enough for the whole run. It holds each episode of one action
+    several times: hindsight adds relabelled copies with the same state and action.
     """
     replay = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1]).arrays["replay"]
     found = keys(replay["state"], replay["action"])
@@ -144,7 +144,7 @@ def compare(folder: Path, witness: Witness) -> dict[str, int]:
 
 
 WORKERS = 2
-# One update for each transition: slow enough that the replay holds the whole run.
+# One update for each transition: slow enough that the replay buffer holds the whole run.
 SETTINGS = (
     f"workers={WORKERS}",
     "agent.updates_per_transition=1.0",
@@ -154,12 +154,12 @@ SETTINGS = (
     "service.eval_seconds=20",
     "service.checkpoint_minutes=0.5",
 )
-TCP = ("service.bind=127.0.0.1", "service.auth=off")  # the proxy and garbage come to a port
+TCP = ("service.bind=127.0.0.1", "service.auth=off")  # proxy and garbage need a port without keys
 PAUSE_S = (1.0, 5.0)  # between the recovery from one fault and the next
 FROZEN_S = (3.0, 15.0)
 CUT_S = (5.0, 20.0)
 PATIENCE_S = 120.0
-# Players are heard of every two seconds, and the status is a second old.
+# Players send a heartbeat every two seconds, and the status may be a second old.
 FRESH_S, SETTLE_S = 3.5, 4.0
 EVALUATES, SILENT = WORKER_COLUMNS.index("evaluator"), WORKER_COLUMNS.index("silent_s")
 GARBAGE = 200
@@ -167,15 +167,16 @@ GARBAGE = 200
 
 @dataclass
 class Trial:
-    """A training under fire.
+    """A training with faults.
 
     Attributes:
-        folder: of the run.
-        launcher: tangram-train.
-        proxy: between the witness and the master.
-        port: of the master.
-        dice: decides everything.
-        faults: kind -> seconds until the run was whole again; infinite where it never was.
+        folder: run folder.
+        launcher: process of tangram-train.
+        proxy: proxy between the witness and the master.
+        port: port of the master.
+        dice: random generator of the faults.
+        context: ZeroMQ context for sockets to the master.
+        faults: kind of fault -> seconds until each recovery; infinite without recovery.
     """
 
     folder: Path
@@ -187,14 +188,14 @@ class Trial:
     faults: dict[str, list[float]] = field(default_factory=dict)
 
     def status(self) -> RunStatus | None:
-        """How the run stands; None while the master does not answer."""
+        """The status of the run; None if the master does not answer."""
         try:
             return ask_status(str(self.folder), self.context, 3.0)
         except TangramError:
             return None
 
     def is_whole(self, updates: float) -> bool:
-        """Whether all workers were heard of just now, and there are more updates than before."""
+        """Whether all workers sent a heartbeat lately, and more than `updates` updates are done."""
         now = self.status()
         if now is None:
             return False
@@ -204,11 +205,11 @@ class Trial:
         return bool(here) and now.numbers["updates"] > updates
 
     def pids(self, words: str) -> list[int]:
-        """Processes of the run whose command line holds these words."""
+        """Ids of the processes of the run whose command line contains `words`."""
         return [one.pid for one, line in processes_of(self.folder).items() if words in line]
 
     def strike(self, kind: str) -> None:
-        """One fault, and the time until all take part again and learning has gone on."""
+        """Cause one fault, and measure the time until all workers are back and learning goes on."""
         status = self.status()
         before = 0.0 if status is None else status.numbers["updates"]
         KINDS[kind](self)
@@ -253,7 +254,7 @@ def _cut(*directions: str) -> Callable[[Trial], None]:
 
 
 def _garbage(trial: Trial) -> None:
-    """Random frames from a stranger, and random bytes that are not even a handshake."""
+    """Send random ZeroMQ messages, and random bytes without a handshake."""
     with trial.context.socket(zmq.DEALER) as stranger:
         stranger.setsockopt(zmq.LINGER, 0)
         stranger.connect(f"tcp://127.0.0.1:{trial.port}")
@@ -280,16 +281,17 @@ KINDS: dict[str, Callable[[Trial], None]] = {
 
 
 def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
-    """Train under faults, compare with an undisturbed training, and report.
+    """Run a training with faults, compare it with an undisturbed training, and report.
 
     Args:
-        minutes: of faults.
-        seed: of the dice, and of both trainings.
-        out: JSON file.
-        folder: for the two runs; must not hold any.
+        minutes: time with faults.
+        seed: seed of the faults and of both trainings.
+        out: JSON file for the results; None writes none.
+        folder: folder for the two runs, without any runs yet.
 
     Returns:
-        0 if the run recovered from every fault and nothing was lost, doubled or left, else 1.
+        0 if the run recovered from every fault, no episode was lost or doubled and no process was
+        left over, else 1.
     """
     disturbed, straight = folder / "disturbed", folder / "straight"
     port = free_port()
@@ -312,7 +314,7 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
     start_training(straight, f"seed={seed}", f"max_updates={result['updates']}", *SETTINGS).wait()
     unhealed = sum(took == float("inf") for times in trial.faults.values() for took in times)
     rows = [_row(kind, times) for kind, times in sorted(trial.faults.items())]
-    show("faults, and seconds until the run was whole again", rows)
+    show("faults, and seconds until the run had recovered", rows)
     outcome = {
         "faults": sum(map(len, trial.faults.values())),
         "not_recovered_from": unhealed,
@@ -331,7 +333,7 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
 
 
 def _rage(trial: Trial, seconds: float) -> None:
-    """Faults until the time is over; each kind comes as often as the others, in random order."""
+    """Cause faults until the time is over, every kind equally often, in random order."""
     until, bag = time.monotonic() + seconds, list[str]()
     while time.monotonic() < until and trial.launcher.poll() is None:
         if not bag:
@@ -339,7 +341,10 @@ def _rage(trial: Trial, seconds: float) -> None:
         kind = bag.pop()
         trial.strike(kind)
         left = until - time.monotonic()
-        print(f"{left:5.0f} s left: {kind}, whole after {trial.faults[kind][-1]:.1f} s", flush=True)
+        print(
+            f"{left:5.0f} s left: {kind}, recovered after {trial.faults[kind][-1]:.1f} s",
+            flush=True,
+        )
         time.sleep(trial.dice.uniform(*PAUSE_S))
 
 

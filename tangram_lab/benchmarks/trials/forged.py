@@ -1,4 +1,4 @@
-"""Mutated messages, as a hostile worker would send them."""
+"""Mutated messages, as a hostile worker may send them."""
 
 import random
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from tangram_core.wire.schema import CHECKSUM, checksum
 
 
 def valid_messages(setup: Setup) -> list[list[bytes]]:
-    """One of each kind that a worker sends, as frames."""
+    """The frames of one message of each kind that a worker sends."""
     spec = setup.spec
     picture = np.zeros((4, PICTURE_WIDTH, 3), np.uint8)
     return [
@@ -35,7 +35,7 @@ def valid_messages(setup: Setup) -> list[list[bytes]]:
 
 
 def mutated(frames: Sequence[bytes], dice: random.Random) -> list[bytes]:
-    """The message with one to three changes: in a frame, or in the row of frames."""
+    """A message with one to three random changes, inside a frame or to the list of frames."""
     changed = list(frames)
     for _ in range(dice.randrange(1, 4)):
         place = dice.randrange(len(changed)) if changed else 0
@@ -67,7 +67,7 @@ def mutated(frames: Sequence[bytes], dice: random.Random) -> list[bytes]:
 
 
 def resealed(frames: Sequence[bytes]) -> list[bytes]:
-    """The message with the checksum that it should have: what a hostile sender would send."""
+    """A message with a correct checksum, as a hostile sender would make it."""
     if not frames:
         return []
     body = frames[0][:-CHECKSUM]
@@ -75,6 +75,6 @@ def resealed(frames: Sequence[bytes]) -> list[bytes]:
 
 
 def fuzzed(valid: Sequence[Sequence[bytes]], dice: random.Random) -> list[bytes]:
-    """A mutated message; the checksum stops every second one, and the others go on behind it."""
+    """A mutated message; half of these messages get a correct checksum, to pass this check."""
     frames = mutated(dice.choice(valid), dice)
     return resealed(frames) if dice.random() < 0.5 else frames

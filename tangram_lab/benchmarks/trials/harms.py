@@ -1,4 +1,4 @@
-"""Trainings that are harmed: their folders, disks and processes, and an order in lockstep."""
+"""Attacks on the folder, disk and processes of a training, and on a lockstep training."""
 
 import os
 import time
@@ -30,9 +30,9 @@ from tangram_lab.benchmarks.trials.target import (
 )
 from worker.talk.client import Client
 
-LEARNS_LITTLE = "agent.updates_per_transition=0.1"  # nobody asks for its score
+LEARNS_LITTLE = "agent.updates_per_transition=0.1"  # the score of this training is not used
 SILENCE = "service.silence_seconds=6"
-BUSY_PERCENT = 20.0  # of a core: between scores it sleeps
+BUSY_PERCENT = 20.0  # of a core: an evaluator at work; it sleeps between evaluations
 ODD_NAME = "a=run \\of \"ü'"
 
 
@@ -52,7 +52,7 @@ def second_master(target: Target) -> Seen:
 
 
 def killed(target: Target) -> bool:
-    """Whether a training goes on after its master was killed, with batches in the journal alone."""
+    """Kill the master while batches are only in the journal; True if the training goes on."""
     target.checkpoint()
     target.goes_on(20.0)
     master = target.master
@@ -61,7 +61,7 @@ def killed(target: Target) -> bool:
 
 
 def killed_after_huge_numbers(target: Target) -> Seen:
-    """With a batch, so that the numbers would be in journal and checkpoint."""
+    """Send a batch with the largest numbers, so journal and checkpoint contain them; then kill."""
     setup = target.setup
     batch = EpisodeBatch(1, 0, episodes_of(setup, 1)).encode(setup.spec)
     for huge in (2**63 - 1, MAX_COUNT):
@@ -72,7 +72,7 @@ def killed_after_huge_numbers(target: Target) -> Seen:
 
 
 def killed_after_unlink(target: Target) -> Seen:
-    """Just after a checkpoint, so that it is not the next one that begins another segment."""
+    """Delete the journal just after a checkpoint, so the next one is too late to replace it."""
     journal = target.folder / "journal"
     target.checkpoint()
     for path in segments(journal).values():
@@ -98,7 +98,7 @@ def folder_away(target: Target) -> Seen:
 def full_disk(target: Target) -> Seen:
     master = target.master
     before = master.rlimit(psutil.RLIMIT_FSIZE)
-    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))  # what it says has no room either
+    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))  # log lines find no room, either
     until_s, taken, stands = time.monotonic() + 15.0, -1.0, False
     while not stands and time.monotonic() < until_s:
         stands, taken = target.numbers()["episodes"] == taken, target.numbers()["episodes"]
@@ -106,7 +106,7 @@ def full_disk(target: Target) -> Seen:
     master.rlimit(psutil.RLIMIT_FSIZE, before)
     held = target.goes_on(10.0) and target.master.pid == master.pid
     told = "batches are taken in" in target.told()
-    return stands and held, f"it stands: {stands}; with room again it goes on: {held}; told: {told}"
+    return stands and held, f"it pauses: {stands}; with room again it goes on: {held}; told: {told}"
 
 
 def frozen(target: Target) -> Seen:
@@ -119,7 +119,7 @@ def frozen(target: Target) -> Seen:
 
 
 def asleep(target: Target) -> Seen:
-    """A laptop's lid: the worker was forgotten, and comes back."""
+    """Suspend a worker until the master forgets it, as when a laptop sleeps; then resume it."""
     worker = target.process("role=player")
     worker.suspend()
     fewer = until(lambda: target.numbers()["players"] < WORKERS + 1)
@@ -129,7 +129,7 @@ def asleep(target: Target) -> Seen:
 
 
 def without_evaluator(target: Target) -> Seen:
-    """It is killed in the middle of a score."""
+    """Kill the evaluator during an evaluation, and check that scores go on."""
     one = target.process("role=evaluator")
     until(lambda: one.cpu_percent(0.5) > BUSY_PERCENT)
     one.kill()
@@ -143,7 +143,7 @@ OWN: list[Attack] = [
     ("2", "the largest numbers, then kill -9", "1 kill", killed_after_huge_numbers),
     ("8", "the journal unlinked, then kill -9", "1 kill", killed_after_unlink),
     ("8", "the run folder taken away", "3 s", folder_away),
-    ("held", "a full disk", "until it stands", full_disk),
+    ("held", "a full disk", "until it pauses", full_disk),
     ("held", "SIGSTOP", "8 s", frozen),
     ("held", "a worker that sleeps until it is forgotten", "1", asleep),
     ("held", "the evaluator killed in mid-score", "1", without_evaluator),
@@ -170,7 +170,7 @@ LOCKSTEP: list[Attack] = [("6", "another batch than was ordered", "1", wrong_bat
 
 
 def harmed(folder: Path) -> Rows:
-    """What was done to trainings in a folder that harm nobody else, as rows."""
+    """Run the attacks that need trainings of their own in `folder`; return their rows."""
     rows = [*witnessed(folder / ODD_NAME), *tried(STARTS, folder)]
     lockstep = ("service.mode=lockstep", "workers=1", "max_updates=0", "sim=kinematic")
     with training(folder / "lockstep", *lockstep, name="master") as target:
@@ -178,12 +178,12 @@ def harmed(folder: Path) -> Rows:
 
 
 def witnessed(folder: Path) -> Rows:
-    """What was done to a training of its own, with an independent witness; the folder is odd."""
+    """Run the attacks of OWN on one training, with a `Witness` that checks the delivery."""
     with training(folder, "max_updates=0", *OURS, LEARNS_LITTLE, OFTEN, SILENCE) as target:
         witness, rows = Witness(str(folder), target.setup), Rows()
         witness.start()
         target.goes_on(100.0)
-        after = 0  # so many it was acknowledged to
+        after = 0  # attacks after which batches were acknowledged again
         for attack in OWN:
             rows += tried([attack], target)
             after += acknowledged_again(witness)
@@ -198,7 +198,7 @@ def witnessed(folder: Path) -> Rows:
 
 
 def acknowledged_again(witness: Witness) -> bool:
-    """Whether more of what a witness plays is acknowledged from now on."""
+    """Whether more batches of a witness are acknowledged after this call."""
     before = witness.acknowledged
     until(lambda: witness.acknowledged > before or not witness.is_alive(), ENDS_S)
     return witness.acknowledged > before

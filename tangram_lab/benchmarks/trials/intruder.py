@@ -1,4 +1,4 @@
-"""What an intruder tries on a master: another user of its machine, or one without a key."""
+"""Messages to a master from an intruder: another user of the machine, or one without a key."""
 
 import multiprocessing
 import os
@@ -12,15 +12,15 @@ PATIENCE_MS = 2000
 
 
 def knock(endpoint: str, messages: Sequence[Sequence[bytes]], user: int = NOBODY) -> BaseProcess:
-    """A process of another user, where we are root, that says something to a master.
+    """Start a process that sends messages to a master; as another user if this process is root.
 
     Args:
-        endpoint: of the master.
-        messages: one after the other.
-        user: that it becomes.
+        endpoint: address of the master.
+        messages: frames of each message.
+        user: id of that other user.
 
     Returns:
-        The process; its exit code is the number of answers that it got.
+        The process; its exit code is the number of answers it received.
     """
     child = multiprocessing.get_context("fork").Process(
         target=_knock, args=(endpoint, messages, user), daemon=True
@@ -44,4 +44,4 @@ def _knock(endpoint: str, messages: Sequence[Sequence[bytes]], user: int) -> Non
         while answers < len(messages) and stranger.poll(PATIENCE_MS):
             stranger.recv_multipart()
             answers += 1
-    os._exit(answers)  # what was forked with it is not ours to end
+    os._exit(answers)  # skip the cleanup of objects that the fork shares with its parent

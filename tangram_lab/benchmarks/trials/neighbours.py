@@ -1,4 +1,4 @@
-"""What those may do who were given a key of their own, and what others notice of it."""
+"""Attacks by users who have a valid key, and their effect on other users of the same master."""
 
 import json
 import multiprocessing
@@ -28,17 +28,17 @@ from tangram_lab.benchmarks.trials.target import (
 )
 from worker.talk.client import Client
 
-BATCH = 2  # episodes: a slow learner takes in many of them
-FAIR = 0.8  # of the share that a key would have, all alike
+BATCH = 2  # episodes: even a slow learner accepts many such batches per second
+FAIR = 0.8  # of an equal share: less is unfair
 FLOOD_S, SETTLE_S = 5.0, 2.0
 ESCAPE = "\x1b]0;owned\x07\x1b[2J"
 
 
 class Steady(Thread):
-    """A worker with a key of its own that keeps the rules; it has played before.
+    """A worker with its own key that obeys the protocol and sends ready-made episodes.
 
     Attributes:
-        acknowledged: batches.
+        acknowledged: number of acknowledged batches.
     """
 
     def __init__(self, target: Target, name: str = "alice") -> None:
@@ -56,7 +56,7 @@ class Steady(Thread):
         self.join(ENDS_S)
 
     def run(self) -> None:
-        """Send, as fast as it is acknowledged."""
+        """Send batches as fast as the master acknowledges them."""
         setup = self._target.setup
         episodes = episodes_of(setup, BATCH)
         with Client(self._connect, "player", -1, setup.fingerprints(), setup.spec) as client:
@@ -66,7 +66,7 @@ class Steady(Thread):
                 client.send(episodes, 0)
 
     def more(self, count: int) -> bool:
-        """Whether so many more are acknowledged in time."""
+        """Whether `count` more batches are acknowledged in time."""
         goal = self.acknowledged + count
         until(lambda: self.acknowledged >= goal or not self.is_alive())
         return self.acknowledged >= goal
@@ -78,7 +78,7 @@ class Steady(Thread):
 
 
 def stolen(target: Target, kill: bool = False) -> Seen:
-    """Mallory says HELLO with all that alice's lines of the audit tell, and BYE."""
+    """Mallory sends HELLO and BYE with all that the audit log tells about alice."""
     with Steady(target) as alice:
         lines = (target.folder / "audit.jsonl").read_text().splitlines()
         hers = [one for one in map(json.loads, lines) if one.get("key") == "alice"][-1]
@@ -93,13 +93,16 @@ def stolen(target: Target, kill: bool = False) -> Seen:
                 said = target.hello(**fields, first=first), bye
                 answers += target.ask(*said, unanswered=1, file=mallory)["welcome"]
         held = alice.more(8) and not answers
-    losses = target.told().count("acknowledged which are not in")
+    losses = target.told().count("acknowledged batches that are not in")
     return held and not losses, f"{answers} let in, alice goes on: {held}, {losses} losses told"
 
 
 def flood(target: Target, kind: str, connections: int) -> None:
-    """What mallory says as fast as it is taken, from many connections, for as long as he lives."""
-    os.nice(19)  # it is the master's share that counts, not the machine's
+    """Send batches, heartbeats or damaged batches with mallory's key from many connections.
+
+    Never returns; kill the process.
+    """
+    os.nice(19)  # the trial is about shares of the master, not about CPU time of the machine
     spec, episodes = target.setup.spec, episodes_of(target.setup, BATCH)
     damaged = [frame[:-1] + b"\0" for frame in EpisodeBatch(1, 0, episodes).encode(spec)]
     words = {"heartbeats": Heartbeat({}).encode(), "damaged": damaged}
@@ -122,7 +125,7 @@ def flood(target: Target, kind: str, connections: int) -> None:
 
 @contextmanager
 def flooding(target: Target, kind: str, connections: int) -> Iterator[None]:
-    """In another process, so that alice has her own."""
+    """Run `flood` inside this context, in another process so that it does not slow alice's."""
     target.given("mallory")
     hog = multiprocessing.get_context("fork").Process(
         target=flood, args=(target, kind, connections), daemon=True
@@ -136,11 +139,11 @@ def flooding(target: Target, kind: str, connections: int) -> Iterator[None]:
 
 
 def shared(target: Target, kind: str, connections: int) -> Seen:
-    """Whether alice and the run's own keep their shares of three while mallory floods."""
+    """Whether alice and the run's own workers keep a third each while mallory floods."""
     with Steady(target) as alice:
 
         def rates() -> tuple[float, float]:
-            """Of alice and of all, in transitions per second."""
+            """Transitions per second of alice, and of all."""
             before, begun = alice.acknowledged, time.monotonic()
             whole = target.numbers()["transitions"]
             time.sleep(FLOOD_S)
@@ -157,18 +160,18 @@ def shared(target: Target, kind: str, connections: int) -> Seen:
 
 
 def is_fair(alone: tuple[float, float], flooded: tuple[float, float]) -> bool:
-    """Whether one of three keys keeps its share, and a flood takes a half of all at most.
+    """Whether one of three keys keeps its share, and the flood costs at most half of all play.
 
     Args:
-        alone: transitions per second of one key, and of all, before.
-        flooded: the same meanwhile.
+        alone: transitions per second of one key, and of all keys, before the flood.
+        flooded: the same two rates during the flood.
     """
     fair = min(alone[0], flooded[1] / 3.0)
     return flooded[0] >= FAIR * fair and flooded[1] >= FAIR * alone[1] / 2.0
 
 
 def revoked(target: Target) -> Seen:
-    """What somebody says whose key was taken back."""
+    """Whether a revoked key gets no answers."""
     file = target.given("eve")
     change_keys(KeysConfig(str(target.folder), revoke="eve"))
     time.sleep(KEYS_S)
@@ -180,7 +183,7 @@ def revoked(target: Target) -> Seen:
 
 
 def escapes(target: Target) -> Seen:
-    """What a terminal would obey, in all texts that a worker may send."""
+    """Send terminal escape sequences in all texts of a worker; none may be written raw."""
     hello = target.hello(index=3060, process=ESCAPE)
     answers = target.ask(hello, seal("bye", {"reason": ESCAPE}, []), unanswered=1)
     log = (target.folder / "audit.jsonl").read_text()
@@ -189,7 +192,7 @@ def escapes(target: Target) -> Seen:
 
 
 def said(target: Target, fields: dict[str, object], answer: str) -> Seen:
-    """What a HELLO is answered, and whether the training goes on."""
+    """Whether a HELLO with these fields gets this answer, and the training goes on."""
     own: dict[str, object] = {"index": 3070, "process": "said"}
     answers = target.ask(target.hello(**own | fields))
     return answers == {answer: 1} and target.goes_on(), f"answered: {dict(answers)}"

@@ -1,4 +1,4 @@
-"""A TCP proxy that can swallow what passes through it, in one direction or in both."""
+"""A TCP proxy that can drop the data of one direction or of both."""
 
 import selectors
 import socket
@@ -10,10 +10,10 @@ UP, DOWN = "up", "down"  # to the master, from the master
 
 
 class Proxy:
-    """Forwards connections to a port of this machine; `cut` swallows, and keeps them open.
+    """Forwards connections to the port `target` of this machine; `cut` drops their data.
 
     Attributes:
-        port: to connect to.
+        port: the port that clients connect to.
     """
 
     def __init__(self, target: int) -> None:
@@ -37,7 +37,7 @@ class Proxy:
         self._selector.close()
 
     def cut(self, *directions: str) -> None:
-        """Swallow what goes in these directions from now on; none heals."""
+        """Drop the data of these directions from now on; without arguments, forward all again."""
         self._cut = frozenset(directions)
 
     def _serve(self) -> None:

@@ -1,4 +1,4 @@
-"""Starts: what must not keep a run from going on, and whose fault it is where something does."""
+"""Trials of starts: obstacles that must not stop a run, and the exit status if one does."""
 
 import os
 import socket
@@ -25,7 +25,7 @@ LINE = b'{"updates": 1, "mean_reward": 0.5}\n'
 
 
 def two_at_once(folder: Path) -> Seen:
-    """On a new folder: the second one's settings are not those of the first."""
+    """Start two trainings with different settings in one new folder; exactly one may run."""
     run = folder / "twice"
     first = start_training(run, "seed=1", "max_updates=200", *QUICK)
     time.sleep(0.7)
@@ -38,7 +38,7 @@ def two_at_once(folder: Path) -> Seen:
 
 
 def goes_on(folder: Path, name: str, content: bytes) -> Seen:
-    """A run that finished is extended, after something came to lie in its folder."""
+    """Extend a finished run after putting the file `name` into its folder; none if empty."""
     run = folder / "extended"
     updates = 0
     if name:
@@ -61,7 +61,7 @@ def goes_on(folder: Path, name: str, content: bytes) -> Seen:
 
 
 def port_taken(folder: Path) -> Seen:
-    """By a neighbour, who may leave it: not the user's input."""
+    """Start a master on a port in use; its status must say: temporary, not wrong input."""
     with socket.create_server((HOST, 0)) as taken:
         port = f"service.port={taken.getsockname()[1]}"
         own = override("run_dir", str(folder / "taken"))
@@ -77,7 +77,7 @@ def port_taken(folder: Path) -> Seen:
 
 
 def strange_master(folder: Path, name: str) -> Seen:
-    """One whose texts hold what a terminal obeys."""
+    """Connect a command to a master whose texts contain terminal escape sequences."""
     refused = Refused(ESCAPE).encode()
     status = RunStatus({}, {"run": ESCAPE}, np.zeros((0, len(WORKER_COLUMNS)))).encode()
     with zmq.Context() as context, context.socket(zmq.ROUTER) as master:
@@ -129,7 +129,7 @@ STARTS: list[Attack] = [
     ),
     (
         "21",
-        "a lease that a machine left which died",
+        "a lease left by a machine that died",
         "1",
         partial(goes_on, name=LEASE, content=b'{"host": "x", "id": "y"}'),
     ),
@@ -142,7 +142,7 @@ STARTS: list[Attack] = [
     ),
     (
         "20",
-        "escapes from a strange master to who asks",
+        "escapes from a strange master to tangram-status",
         "1",
         partial(strange_master, name="status"),
     ),

@@ -1,4 +1,4 @@
-"""Connections of those who have no key, as many and as expensive as they can be."""
+"""Connections without a key, as many and as expensive to the master as possible."""
 
 import selectors
 import socket
@@ -6,17 +6,17 @@ import struct
 from typing import Self
 from urllib.parse import urlsplit
 
-# ZMTP 3.1 (https://rfc.zeromq.org/spec/37): signature, version, mechanism, not as a server.
+# Greeting of ZMTP 3.1 (https://rfc.zeromq.org/spec/37): signature, version, mechanism, as a client.
 SIGNATURE = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01"
 CURVE, NULL = (SIGNATURE + name.ljust(20, b"\0") + bytes(32) for name in (b"CURVE", b"NULL"))
 READY = b"\x04\x19\x05READY" + b"\x0bSocket-Type" + b"\0\0\0\x03SUB"
 LARGE, LARGE_COMMAND = b"\x02", b"\x06"
 SIZE = struct.Struct(">Q")
-AT_ONCE = 16  # connections that are opened between two looks at the others
+AT_ONCE = 16  # connections opened by one `push`
 
 
 def connection(endpoint: str) -> socket.socket:
-    """Of a stranger."""
+    """A raw socket connected to an ipc or tcp endpoint."""
     if endpoint.startswith("ipc://"):
         one = socket.socket(socket.AF_UNIX)
         one.connect(endpoint.removeprefix("ipc://"))
@@ -26,7 +26,7 @@ def connection(endpoint: str) -> socket.socket:
 
 
 def subscribe(endpoint: str, size: int) -> bool:
-    """Subscribe to a topic so long, on a socket that takes no keys; False if that is not taken."""
+    """Subscribe to a topic of `size` bytes without keys; False if the master closes the socket."""
     with connection(endpoint) as one:
         try:
             one.sendall(NULL + READY + LARGE + SIZE.pack(1 + size) + b"\x01" + bytes(size))
@@ -41,20 +41,20 @@ def subscribe(endpoint: str, size: int) -> bool:
 
 
 class Strangers:
-    """So many connections; where one is ended another takes its place.
+    """Many open connections; each one that the master closes is replaced.
 
     Attributes:
-        opened: connections so far.
-        ended: of them, by the other side.
+        opened: number of connections opened so far.
+        ended: number of connections that have ended.
     """
 
     def __init__(self, endpoint: str, count: int, size: int = 0) -> None:
-        """Nobody is there yet.
+        """Open no connection yet; `push` does.
 
         Args:
-            endpoint: on TCP, of an encrypted socket.
-            count: connections at a time.
-            size: of a frame that each sends but for its last byte, 0 for silence.
+            endpoint: TCP address of an encrypted socket.
+            count: number of connections at a time.
+            size: bytes of a frame that each connection sends except the last byte; 0: send nothing.
         """
         self._endpoint, self._count = endpoint, count
         frame = LARGE_COMMAND + SIZE.pack(size) + bytes(size - 1) if size else b""
@@ -64,7 +64,7 @@ class Strangers:
 
     @property
     def connected(self) -> int:
-        """How many are."""
+        """Number of open connections."""
         return self.opened - self.ended
 
     def __enter__(self) -> Self:
@@ -76,7 +76,7 @@ class Strangers:
         self._selector.close()
 
     def push(self) -> None:
-        """Connect those who are missing, and send what is taken."""
+        """Open some missing connections, and send as much as the master accepts."""
         for _ in range(min(AT_ONCE, self._count - self.connected)):
             self._connect()
         for key, events in self._selector.select(0):

@@ -1,4 +1,4 @@
-"""What is attacked: a training, or files; and how an attack is told."""
+"""The training under attack, and functions that run attacks and report their outcomes."""
 
 import json
 import os
@@ -41,26 +41,27 @@ from tangram_lab.benchmarks.trials.chaos import SETTINGS
 from worker.status import ask_status
 from worker.talk.discovery import find_master
 
-Seen = tuple[bool, str]
-Attack = tuple[str, str, str, Callable[[Any], Seen]]  # row, what, how much, and what does it
+Seen = tuple[bool, str]  # whether the training held, and what was observed
+# Row of the security review, description, amount, and the function that attacks.
+Attack = tuple[str, str, str, Callable[[Any], Seen]]
 Rows = list[dict[str, Any]]
 OFTEN = "service.checkpoint_minutes=0.05"
-# Whoever sends a batch waits until the learner has taken in those before: small ones.
+# Small batches: a worker must wait until the learner has accepted the earlier ones.
 OURS = (*SETTINGS, "service.envs=4")
-ROOM_MIB = 64.0  # that the memory of a master may grow by under any attack
+ROOM_MIB = 64.0  # allowed growth of the master's memory under an attack
 ENDS_S = 60.0
 LOOK_S = 0.1
-KEYS_S = 1.5  # the master looks once in a second who has a key
+KEYS_S = 1.5  # the master reads the list of keys once a second
 HOST = "127.0.0.1"
 
 
 @dataclass
 class Growth:
-    """What a process has grown by.
+    """Growth of a process.
 
     Attributes:
-        mib: of memory, the most.
-        files: that it has open, at the median: on a busy machine all may come at once.
+        mib: largest growth of resident memory, in MiB.
+        files: median growth of open files; on a busy machine many may open at once.
     """
 
     mib: float = 0.0
@@ -72,9 +73,9 @@ class Target:
     """A training under attack.
 
     Attributes:
-        folder: of the run.
-        launcher: tangram-train, or a master alone.
-        context: of the sockets that ask it.
+        folder: run folder.
+        launcher: process of tangram-train, or of a master alone.
+        context: ZeroMQ context for sockets to the master.
     """
 
     folder: Path
@@ -83,33 +84,33 @@ class Target:
 
     @property
     def where(self) -> dict[str, Any]:
-        """What its connection file says."""
+        """The content of the connection file."""
         content: dict[str, Any] = json.loads((self.folder / "connection.json").read_text())
         return content
 
     @cached_property
     def setup(self) -> Setup:
-        """Its task."""
+        """The setup of the run."""
         return make_setup(yaml.safe_load((self.folder / "config.yaml").read_text()))
 
     @property
     def master(self) -> psutil.Process:
-        """The process that learns."""
+        """The process of the master."""
         return self.process("tangram-master")
 
     def process(self, words: str) -> psutil.Process:
-        """One of the run whose title holds these words; TangramError if there is none."""
+        """A process of the run whose title contains `words`; TangramError if there is none."""
         found = [p for p, line in processes_of(self.folder).items() if words in line]
         if not found:
             raise TangramError(f"there is no {words}")
         return found[0]
 
     def numbers(self) -> Mapping[str, float]:
-        """Those of its status; TangramError where it does not answer."""
+        """Name -> number in the status; TangramError if the master does not answer."""
         return ask_status(str(self.folder), self.context, 5.0).numbers
 
     def goes_on(self, more: float = 1.0, name: str = "episodes") -> bool:
-        """Whether so many more of something come in time."""
+        """Whether the number `name` in the status grows by `more` in time."""
         until_s, goal = time.monotonic() + PATIENCE_S, float("inf")
         while time.monotonic() < until_s:
             with suppress(TangramError):
@@ -121,12 +122,12 @@ class Target:
         return False
 
     def told(self) -> str:
-        """All lines of launcher and master."""
+        """All output of launcher and master so far."""
         return (self.folder / "told").read_text(errors="replace")
 
     @contextmanager
     def cost(self) -> Iterator[Growth]:
-        """What the master grows by."""
+        """Measure the growth of the master inside this context; it is complete at the end."""
         process, most, ends = self.master, Growth(), Event()
         mib, files, seen = process.memory_info().rss / MIB, process.num_fds(), [0]
 
@@ -147,11 +148,11 @@ class Target:
 
     @property
     def points(self) -> Path:
-        """The folder of its checkpoints."""
+        """The folder of checkpoints."""
         return self.folder / "checkpoints"
 
     def given(self, name: str) -> Path:
-        """The connection file of somebody who has a key of his own."""
+        """The connection file of user `name` with an own key; made if it does not exist."""
         file = self.folder.with_name(f"{name}.json")
         if not file.exists():
             change_keys(KeysConfig(str(self.folder), add=name, out=str(file)))
@@ -162,14 +163,14 @@ class Target:
     def peer(
         self, kind: int = zmq.DEALER, role: str = "player", file: Path | None = None, **options: int
     ) -> Iterator[Any]:
-        """A socket with the keys of a role; of an unknown role, with new ones; of none, without.
+        """A connected socket with the keys of a role from the run or from a connection file.
 
-        The keys are the run's own, or those of a connection file.
+        An unknown role gets new keys, which the master does not know; an empty role gets no keys.
         """
         where, address = self.where, find_master(str(file or self.folder))
         with self.context.socket(kind) as one:
             one.setsockopt(zmq.LINGER, 0)
-            one.setsockopt(zmq.SNDTIMEO, 5000)  # it may be gone
+            one.setsockopt(zmq.SNDTIMEO, 5000)  # the master may have ended
             if address is not None and address.keys and role:
                 made = (key.decode() for key in zmq.curve_keypair())
                 public, secret = address.keys.get(role, made)
@@ -188,7 +189,10 @@ class Target:
         unanswered: int = 0,
         file: Path | None = None,
     ) -> Counter[str]:
-        """The kinds of the answers that a new connection gets, to all but so many messages."""
+        """Send messages on a new connection and count the answers by kind.
+
+        Waits for one answer to each message, except for `unanswered` of them.
+        """
         answers, count = Counter[str](), len(messages) - unanswered
         with self.peer(role=role, file=file) as one:
             for frames in messages:
@@ -198,17 +202,17 @@ class Target:
         return answers
 
     def port(self, name: str) -> tuple[str, int]:
-        """Where something listens, as its connection file has it."""
+        """Host and port of an endpoint, by its name in the connection file."""
         return HOST, urlsplit(self.where[name]).port or 0
 
     def hello(self, **fields: object) -> list[bytes]:
-        """A HELLO of a player, with fields that no worker would send."""
+        """The frames of a HELLO of a player; `fields` replace valid values by forged ones."""
         own: dict[str, object] = {"role": "player", "index": 3000, "incarnation": 0}
         own |= {"process": "attacker", "first": 1, "fingerprints": self.setup.fingerprints()}
         return seal(Hello.kind, {**own, "run_id": self.where["run_id"], **fields}, [])
 
     def cheap(self, deed: Callable[[], object], room_mib: float = ROOM_MIB) -> Seen:
-        """Whether a deed costs little memory, and the same master goes on."""
+        """Whether an attack costs at most `room_mib` MiB and the same master process goes on."""
         pid = self.master.pid
         with self.cost() as most:
             deed()
@@ -217,13 +221,13 @@ class Target:
         return same and most.mib <= room_mib, seen
 
     def newest(self) -> str:
-        """Name of the newest checkpoint, empty before the first."""
+        """Name of the newest checkpoint; empty before the first."""
         return next((one.name for one in reversed(list_checkpoints(self.points))), "")
 
     def checkpoint(self) -> Mapping[str, Any]:
-        """The counters of a checkpoint that begins from now on."""
+        """Wait for a checkpoint that begins after this call, and return its counters."""
         seen, until_s = {self.newest()}, time.monotonic() + ENDS_S
-        while len(seen) < 3 and time.monotonic() < until_s:  # one may be on its way
+        while len(seen) < 3 and time.monotonic() < until_s:  # the first may have begun before
             seen.add(self.newest())
             time.sleep(LOOK_S / 2)
         return load_checkpoint(self.points / self.newest(), []).counters
@@ -233,7 +237,7 @@ class Target:
 def started(
     folder: Path, *settings: str, name: str = "train"
 ) -> Iterator["subprocess.Popen[bytes]"]:
-    """A training until the end of the block, which ends it in order."""
+    """Run a training inside this context; it is terminated at the end."""
     launcher = start_training(folder, *settings, name=name)
     try:
         yield launcher
@@ -244,7 +248,7 @@ def started(
 
 @contextmanager
 def training(folder: Path, *settings: str, name: str = "train") -> Iterator[Target]:
-    """The same, once it can be reached."""
+    """Run a training inside this context, which begins once the training can be reached."""
     with started(folder, *settings, name=name) as launcher, zmq.Context() as context:
         wait_for(folder / "connection.json", launcher)
         context.set(zmq.MAX_SOCKETS, 4096)
@@ -252,7 +256,7 @@ def training(folder: Path, *settings: str, name: str = "train") -> Iterator[Targ
 
 
 def episodes_of(setup: Setup, count: int) -> Episodes:
-    """Episodes of the right shapes; nobody has played them."""
+    """Random episodes of the right shapes, not played in the task."""
     dice = np.random.default_rng(0)
     return Episodes(
         {
@@ -263,7 +267,7 @@ def episodes_of(setup: Setup, count: int) -> Episodes:
 
 
 def until(done: Callable[[], object], within_s: float = ENDS_S) -> bool:
-    """Wait for something; False if it does not come in time. What fails has not come yet."""
+    """Wait until `done` returns true; False after `within_s`. An error counts as not done yet."""
     until_s = time.monotonic() + within_s
     while time.monotonic() < until_s:
         with suppress(TangramError, psutil.Error, OSError):
@@ -274,7 +278,7 @@ def until(done: Callable[[], object], within_s: float = ENDS_S) -> bool:
 
 
 def one_line(*arguments: str, cwd: Path, status: int = 2) -> Seen:
-    """Whether a command refuses in one line, with an exit status."""
+    """Whether a command ends with this exit status and one line of error text."""
     done = subprocess.run(
         [*command(arguments[0]), *arguments[1:]],
         cwd=cwd,
@@ -292,12 +296,12 @@ def one_line(*arguments: str, cwd: Path, status: int = 2) -> Seen:
 
 
 def tried(attacks: Iterable[Attack], target: Any) -> Iterator[dict[str, Any]]:
-    """Each attack with its outcome, as a row; an attack that fails has not held."""
+    """Run attacks and yield a row for each; an exception counts as "not held"."""
     for row, what, count, strike in attacks:
         begun = time.monotonic()
         try:
             held, seen = strike(target)
-        except Exception as error:  # noqa: BLE001  # a training that is gone answers with anything
+        except Exception as error:  # noqa: BLE001  # a broken training may cause any error
             held, seen = False, repr(error)
         took = time.monotonic() - begun
         said = "held" if held else "NOT HELD"

@@ -175,7 +175,7 @@ def test_a_run_stays_with_what_it_began_with(began: bool) -> None:
     before = Trainer(made, 0, "cpu", compiled=began)
     arrays, counters = before.state()
     Trainer(made, 0, "cpu", compiled=began).load_state(arrays, counters)
-    message = f"learned with service.compile={str(began).lower()} so far"
+    message = f"began with service.compile={str(began).lower()}"
     with pytest.raises(RunError, match=message):
         Trainer(made, 0, "cpu", compiled=not began).load_state(arrays, counters)
 

@@ -191,6 +191,6 @@ def test_a_photograph_is_not_written_over(tmp_path: Path) -> None:
     target, link = photo(tmp_path / "it.png", levels(LAYOUT, POSES)), tmp_path / "link.png"
     link.symlink_to(target)
     for out in (target, str(link)):
-        with pytest.raises(ConfigError, match="^out=.* would be written over target=.*it.png: "):
+        with pytest.raises(ConfigError, match="^out=.* would overwrite target=.*it.png: "):
             PlayConfig(out=out, target=target)
     PlayConfig(out=str(tmp_path / "another.png"), target=target)

@@ -179,7 +179,7 @@ def test_a_figure_that_is_cut_off_is_refused(tmp_path: Path) -> None:
     read(str(tmp_path / "speck.png"))
     ImageDraw.Draw(both).rectangle((0, 100, 60, 160), 40)
     both.save(tmp_path / "both.png")
-    with pytest.raises(ConfigError, match="is cut off: a part of it reaches the picture's edge"):
+    with pytest.raises(ConfigError, match="is cut off by the picture's edge: leave ground"):
         read(str(tmp_path / "both.png"))
 
 
@@ -201,7 +201,7 @@ def test_what_fills_a_picture_badly_does_not_fill_it(
     [
         ({"puzzle": ("cat",)}, "silhouette"),
         ({"target": "photo.png"}, "silhouette"),
-        ({"out": "cat.png", "silhouette": "cat.png"}, "written over silhouette"),
+        ({"out": "cat.png", "silhouette": "cat.png"}, "overwrite silhouette"),
         ({"changes": {"sim": {"targets": "uniform"}}}, "leave silhouette out"),
     ],
 )

@@ -155,7 +155,7 @@ def test_the_schema_is_that_of_the_file() -> None:
 def test_data_are_of_a_figure_or_of_a_finger(tmp_path: Path) -> None:
     for given in (["run_dir=pretrained/square"], ["puzzle=cat"], ["run_dir=pretrained/hand"]):
         out = f"out={tmp_path}/it.svg"
-        with pytest.raises(ConfigError, match=r"^out=.*it\.svg is for where tokens lie in a fi"):
+        with pytest.raises(ConfigError, match=r"^out=.*it\.svg is for positions of tokens in a fi"):
             _play(composed("play", [*given, out]))
 
 

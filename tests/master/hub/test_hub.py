@@ -66,8 +66,8 @@ def test_broadcasts_take_so_long_as_their_bytes_for_all_who_take_part(stage: Sta
 
 NO_ROOM = Room(RESERVE + HANDSHAKES)
 DIFFERS = (
-    "its settings of {0} differ from the master's ({1}): leave them out, for connect=RUN_DIR "
-    "brings the master's, or start both with the same overrides of {0}"
+    "its settings of {0} differ from the master's ({1}): leave them out, since connect=RUN_DIR "
+    "loads the master's, or start both with the same overrides of {0}"
 )
 
 
@@ -99,13 +99,13 @@ DIFFERS = (
         (
             {"run_id": "another"},
             "refused_run",
-            "this master runs 'run', not 'another': the connection file is stale, take the one of "
-            "a master that is running",
+            "this master runs 'run', not 'another': the connection file is stale, use the file of "
+            "a running master",
         ),
         (
             {},
             "refused_full",
-            f"0 processes take part already, the most that {NO_ROOM.files} open files allow: raise "
+            f"0 processes take part, the most that {NO_ROOM.files} open files allow: raise "
             "ulimit -n and start the master again",
         ),
     ],
@@ -230,7 +230,7 @@ def test_scores_that_the_task_does_not_declare_are_refused(stage: Stage) -> None
     dealer.join(role="evaluator")
     stage.hub.publish(weights(7))
     sent = replace(scores(), weights_version=7, scalars={"mean_reward": 0.5, "made_up": 1.0})
-    told = "evaluator 0: scores: the task has none that is called made_up"
+    told = "evaluator 0: scores: the task has no score named made_up"
     assert dealer.ask(sent.encode(SPEC)) == Reject(told, sequence=0, final=True)
     assert stage.arrivals == []
 
@@ -250,7 +250,7 @@ def test_scores_are_taken_once_for_each_of_the_published_weights(
         (7, 0, 7, ""),
         (7, 0, 7, "it has scored weights 7 before"),
         (7, 1, 7, ""),
-        (7, 2, 7, "2 evaluators have scored weights 7, the most that may"),
+        (7, 2, 7, "2 evaluators have scored weights 7, which is the limit"),
         (8, 0, 8, ""),
         (8, 0, 6, unknown.format(6)),
     ):

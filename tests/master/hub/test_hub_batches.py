@@ -35,7 +35,7 @@ def test_in_lockstep_a_batch_is_what_was_ordered_or_it_is_ordered_again() -> Non
         player = stage.dealer()
         player.join(index=0)
         # As after a restart: it was played for an order of the master before this one.
-        waits = "player 0: batch 1: nothing is ordered of it now"
+        waits = "player 0: batch 1: this player has no order now"
         player.send(1)
         assert player.hear() == Reject(reason=waits, sequence=1, final=False)
         order = Go(4, 9, 12, 3)
@@ -47,7 +47,8 @@ def test_in_lockstep_a_batch_is_what_was_ordered_or_it_is_ordered_again() -> Non
             assert isinstance(refused, Reject)
             assert refused.final
             assert refused.reason.endswith(
-                f"3 episodes with weights 7, ordered were {few.episodes} with weights {few.version}"
+                f"3 episodes with weights 7, but the order was {few.episodes} "
+                f"with weights {few.version}"
             )
             assert player.hear() == few
         stage.hub.order({0: Go(4, 7, 12, 3)})
@@ -56,7 +57,7 @@ def test_in_lockstep_a_batch_is_what_was_ordered_or_it_is_ordered_again() -> Non
         stage.counted("batches")
         # It came, so that nothing more is ordered: a second one waits, the first is known.
         assert player.ask(batch(4).encode(SPEC)) == Reject(
-            reason="player 0: batch 4: nothing is ordered of it now", sequence=4, final=False
+            reason="player 0: batch 4: this player has no order now", sequence=4, final=False
         )
         stage.hub.acknowledge(stage.batches()[0])
         assert player.hear() == Ack(3, duplicate=False)
@@ -98,7 +99,7 @@ def test_duplicates_gaps_and_what_is_over_the_window_are_not_delivered(
     gap = "batch 2: batch 1 must come first"
     assert player.hear() == Reject(reason=gap, sequence=2, final=False)
     player.send(1, 1, *range(2, WINDOW + 2))  # the second 1 is held: answered after its insert
-    excess = "batch 4: 3 batches are unacknowledged, the most there may be"
+    excess = "batch 4: 3 batches are unacknowledged, which is the limit"
     assert player.hear() == Reject(reason=excess, sequence=4, final=False)
     assert [a.sequence for a in stage.batches()] == [1, 2, 3]
     stage.hub.acknowledge(stage.batches()[0])
@@ -161,7 +162,7 @@ def test_a_damaged_batch_is_no_batch_and_who_sends_nothing_else_must_end(
         assert isinstance(player.ask(flipped(1)), Reject)
         assert player.beat() == [Alive(-1)]  # small messages may come through all the time
     assert player.ask(flipped(1)) == Stop(
-        "6 messages of player 0 in a row were damaged on their way: look at the memory and the "
+        "6 messages of player 0 in a row were damaged on their way: check the memory and the "
         "network of its machine"
     )
 
@@ -217,6 +218,6 @@ def test_what_the_disk_lost_is_told_when_its_worker_comes_back(
         dealer.say(Bye("done"))
         stage.until(lambda: not stage.hub.peers)
     assert [r.message for r in caplog.records] == [
-        "losses (number 1): player 0 says that 3 of its batches were acknowledged which are not in "
-        "the replay: the disk has lost them, if it is right"
+        "losses (number 1): player 0 reports 3 acknowledged batches that are not in "
+        "the replay: if this is right, the disk has lost them"
     ]

@@ -63,7 +63,7 @@ def test_a_file_that_holds_something_else_is_refused(tmp_path: Path, change: obj
     path = tmp_path / "keys.json"
     whole = isinstance(change, str)
     path.write_text(str(change) if whole else json.dumps(make_keys().content() | dict(change)))
-    with pytest.raises(RunError, match=r"keys\.json does not hold the run's keys .*: delete it"):
+    with pytest.raises(RunError, match=r"keys\.json does not hold the run's keys .*: delete"):
         run_keys(path)
 
 
@@ -122,7 +122,7 @@ def test_a_folder_too_deep_for_sockets_is_refused(
     deep = tmp_path / ("x" * 80)
     deep.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(deep))
-    with pytest.raises(ConfigError, match=r"have 107 bytes at most: set TMPDIR to a shorter one"):
+    with pytest.raises(ConfigError, match=r"at most 107 bytes: set TMPDIR to a shorter path"):
         listening_place("local", tmp_path)
 
 
@@ -133,7 +133,7 @@ def test_a_folder_whose_name_is_no_text_is_refused_before_anything_is_made(
     odd.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(odd))
     with pytest.raises(
-        ConfigError, match=r"a\\xff/tangram-.*' cannot hold sockets, whose .*: set TM"
+        ConfigError, match=r"a\\xff/tangram-.*' cannot hold sockets, as their .*: set TM"
     ):
         listening_place("local", tmp_path)
     assert list(odd.iterdir()) == []
@@ -165,7 +165,7 @@ def test_a_run_without_keys_says_why(tmp_path: Path) -> None:
     assert told(folder.config) == f"run_dir={folder.config} is a file: {where}"
     assert "has no keys: they are made when its master first listens" in told(folder.path)
     folder.result.touch()
-    assert told(folder.path) == "run run has ended, and nobody needed a key"
+    assert told(folder.path) == "run run has ended, and it had no keys"
 
 
 def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
@@ -173,13 +173,13 @@ def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
     own = ["player: role=player, of the run itself", "evaluator: role=evaluator, of the run itself"]
     made = run_keys(file)
     assert keys_of(tmp_path) == own
-    with pytest.raises(RunError, match=r"no master of .* listens on an address with keys: start"):
+    with pytest.raises(RunError, match=r"no master of .* on a network address with keys: start"):
         keys_of(tmp_path, add="alice")
     where = {"endpoint": "tcp://h:1", "run_id": "r", "server_key": made.server.public}
     connection = where | {"keys": {"player": asdict(made.player)}, "settings": {}}
     (tmp_path / "connection.json").write_text(json.dumps(connection))
     line = "tangram-worker connect=alice.json role=evaluator"
-    told = f"{out} lets alice take part as evaluator ({line}): hand it on by a private way"
+    told = f"{out} lets alice take part as evaluator ({line}): send it over a private way"
     assert keys_of(tmp_path, add="alice", role="evaluator", out=str(out)) == [told]
     assert keys_of(tmp_path) == [*own, "alice: role=evaluator"]
     content = json.loads(out.read_text())
@@ -189,18 +189,18 @@ def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
     public = content["keys"]["evaluator"]["public"]
     assert run_keys(file).given == {"alice": Given("evaluator", public)}
     for settings, reason in (
-        ({"add": "alice"}, "there is a key of alice: revoke it first, or choose another name"),
-        ({"add": "player"}, "there is a key of player: revoke"),
+        ({"add": "alice"}, "alice has a key already: revoke that key first, or choose another"),
+        ({"add": "player"}, "player has a key already: revoke"),
         ({"add": "a/b"}, "add must be a name of at most 64 letters, .* got 'a/b': set add=alice"),
-        ({"add": "bob", "out": str(out)}, "alice.json is there already: name another file"),
-        ({"revoke": "bob"}, r"revoke must name a key that was made here \(alice\), got 'bob'"),
+        ({"add": "bob", "out": str(out)}, "alice.json exists already: name another file"),
+        ({"revoke": "bob"}, r"revoke must name a key made by tangram-keys \(alice\), got 'bob'"),
         ({"revoke": "alice", "add": "bob"}, "add=bob changes nothing with revoke=alice: leave it"),
         ({"out": "x"}, "out=x changes nothing with add=null: leave it out"),
         ({"role": "evaluator"}, "role=evaluator changes nothing with add=null"),
     ):
         with pytest.raises(ConfigError, match=reason):
             keys_of(tmp_path, **settings)
-    assert keys_of(tmp_path, revoke="alice") == ["alice may take part no longer"]
+    assert keys_of(tmp_path, revoke="alice") == ["the key of alice is revoked"]
     assert run_keys(file) == made
     log = [json.loads(line) for line in (tmp_path / "audit.jsonl").read_text().splitlines()]
     assert [(line["event"], line["key"]) for line in log] == [
@@ -219,7 +219,7 @@ def test_keys_that_are_needless_or_will_be_stale_are_told(tmp_path: Path) -> Non
     assert NEEDLESS not in keys_of(tmp_path)
     assert keys_of(tmp_path, add="alice", out=str(out))[1:] == [STALE]
     keys_of(tmp_path, revoke="alice")
-    with pytest.raises(ConfigError, match=r"is there already: delete it \(its key is none of this"):
+    with pytest.raises(ConfigError, match=r"exists already: delete it \(its key is not valid in"):
         keys_of(tmp_path, add="alice", out=str(out))
 
 

@@ -84,7 +84,7 @@ def test_somebody_may_always_move_and_nobody_runs_ahead(
         (
             0.1,
             0,
-            "the lag must be at least 1 update, got 0: no transition could ever be inserted, "
+            "the lag must be at least 1 update, got 0: with less, no transition could be inserted, "
             "so learner and workers would wait for each other for ever",
         ),
         *(

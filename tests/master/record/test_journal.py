@@ -204,7 +204,7 @@ def test_damage_anywhere_in_a_record_costs_that_record_and_is_told_with_its_numb
     ("byte", "told"),
     [
         (HEAD.size + 40, "1 batch is lost"),
-        (5, "the batches that were in there are lost, and nobody knows how many"),
+        (5, "the batches in that part are lost, and their number is unknown"),
     ],
 )
 def test_damage_at_the_end_is_no_torn_record_in_any_later_life(
@@ -241,8 +241,8 @@ def starts(content: bytes) -> list[int]:
         ("body 4, zeros 5", "at least 2 batches are lost"),
         ("zeros 4", "at least 1 batch is lost"),
         ("body 5, cut 6", "at least 1 batch is lost"),
-        ("head 4, cut 5", "the batches that were in there are lost, and nobody knows how many"),
-        ("head 4, head 5, head 6", "the batches that were in there are lost, and nobody knows how"),
+        ("head 4, cut 5", "the batches in that part are lost, and their number is unknown"),
+        ("head 4, head 5, head 6", "the batches in that part are lost, and their number is"),
     ],
 )
 def test_of_a_damaged_end_no_more_is_claimed_than_is_known(
@@ -325,7 +325,7 @@ def test_garbage_in_place_of_a_segment_is_a_loss(tmp_path: Path) -> None:
     warnings.clear()
     assert sequences(tmp_path, warnings=warnings) == []
     assert len(warnings) == 1
-    assert "damaged at byte 0: the batches that were in there are lost, and nob" in warnings[0]
+    assert "damaged at byte 0: the batches in that part are lost, and their n" in warnings[0]
     assert journal_run_id(tmp_path) is None
     journal(tmp_path, MADE).append(arrival(MADE, 4))
     assert sequences(tmp_path, warnings=warnings) == [4]
@@ -360,8 +360,8 @@ def test_a_newest_segment_that_is_missing_is_a_loss_where_a_checkpoint_names_it(
     segments(tmp_path)[2].unlink()
     assert sequences(tmp_path, warnings=warnings, after=place) == []
     assert warnings == [
-        f"{tmp_path / '00000002.log'} is missing: the batches that were in there are lost, and "
-        "nobody knows how many"
+        f"{tmp_path / '00000002.log'} is missing: the batches in that part are lost, and "
+        "their number is unknown"
     ]
 
 
@@ -407,7 +407,7 @@ def test_one_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
         journal_run_id(tmp_path)
     [later] = Title(FORMAT + 1, "run", MADE.task_digest()).encode()
     path.write_bytes(record(later))
-    with pytest.raises(RunError, match=r"is no segment of format 5: choose another run_dir"):
+    with pytest.raises(RunError, match=r"is not a segment of format 5: choose another run_dir"):
         read(tmp_path)
 
 

@@ -62,7 +62,7 @@ def test_a_process_of_another_machine_that_lives_keeps_its_folder(tmp_path: Path
         assert json.loads(path.read_text())["id"] != "theirs"
         claim.run.path.joinpath(".lock").unlink()
         of_another(tmp_path)
-        told = r"cannot be claimed anew \(another process works there\)"
+        told = r"cannot be locked again \(another process uses it\)"
         with living(path), pytest.raises(FolderError, match=told):
             claim.check()
 

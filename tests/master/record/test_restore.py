@@ -87,13 +87,13 @@ def test_corrupt_ones_are_set_aside_and_no_run_is_begun_anew_because_all_are(
     assert restore_run(tmp_path, resumed) is not None
     assert resumed.updates == 2
     assert caplog.messages == [
-        f"checkpoint {second} is corrupt (checksum of learner.safetensors differs): it is "
-        f"{second.name}.corrupt now, and the one before is taken"
+        f"checkpoint {second} is corrupt (checksum of learner.safetensors differs): it was renamed "
+        f"to {second.name}.corrupt, and the one before is used"
     ]
     assert list_checkpoints(tmp_path) == [first]
     damage(first)
     for _ in range(2):  # the second time both are out of the way, and still no run begins
-        with pytest.raises(RunError, match=r"no checkpoint in .* is whole: put one from a backup"):
+        with pytest.raises(RunError, match=r"no checkpoint in .* is intact: put one from a backup"):
             restore_run(tmp_path, trainer(MADE))
         assert len(caplog.messages) == 2
 
@@ -135,7 +135,7 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
     found = load_checkpoint(path)
     counters = {name: value for name, value in found.counters.items() if name != lost}
     save_checkpoint(tmp_path, 1, found.arrays, counters, keep=1)
-    with pytest.raises(RunError, match=f"not that of a run .KeyError: '{lost}'"):
+    with pytest.raises(RunError, match=f"it is not the checkpoint of a run .KeyError: '{lost}'"):
         restore_run(tmp_path, trainer(MADE))
 
 
@@ -143,14 +143,14 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
     ("forged", "reason"),
     [
         ({"setup": 3}, "other settings of net, reward, sim, task, tokens"),
-        ({"rate_limiter": 3}, "not that of a run .AttributeError"),
-        ({"episodes": 1e400}, "not that of a run .OverflowError"),
+        ({"rate_limiter": 3}, "it is not the checkpoint of a run .AttributeError"),
+        ({"episodes": 1e400}, "it is not the checkpoint of a run .OverflowError"),
         ({"record": Record().state() | {"loop_s": "x"}}, "Expected `float`, got `str` - at"),
         ({"record": {}}, "record lacks .*: start a new run"),
         ({"record": Record().state() | {"scores": []}}, "Expected `object`, got `array`"),
-        ({"journal": {"segment": 2**63 - 1}}, "its place in the journal .*<= 9007199254740992"),
-        ({"journal": -1}, "its place in the journal cannot be read .* delete it to use"),
-        ({"journal": {"number": True}}, "its place in the journal .*Expected `int`, got `bool`"),
+        ({"journal": {"segment": 2**63 - 1}}, "its position in the journal .*<= 9007199254740992"),
+        ({"journal": -1}, "its position in the journal cannot be read .* delete the checkpoint to"),
+        ({"journal": {"number": True}}, "its position in the journal .*Expected `int`, got `bool`"),
     ],
 )
 def test_a_checkpoint_with_a_part_of_another_kind_is_refused(

@@ -85,7 +85,7 @@ def test_what_lies_in_the_place_of_curves_is_set_aside(
     assert len(lines(curve)) == 1
     (aside,) = tmp_path.glob("*.aside")
     assert caplog.messages == [
-        f"{tmp_path / place} was no curve that can be gone on with: it is {aside.name} now"
+        f"{tmp_path / place} was not a readable curve: it was renamed to {aside.name}"
     ]
 
 
@@ -141,7 +141,7 @@ def test_a_disk_that_takes_no_curves_leaves_a_gap_and_ends_nothing(
         metrics.scores({"b": 1.0}, 3, 30, 3.0)
     metrics.scalars({"a": 1.0}, 4)
     metrics.close()
-    told = "curves cannot be written (No space left on device): a gap is left in them"
+    told = "curves cannot be written (No space left on device): points are missing"
     assert told in {record.message for record in caplog.records}
     files = [read(path) for path in tmp_path.glob("events.*")]
     steps = [p[0] for file in files if "a" in file.Tags()["scalars"] for p in points(file, "a")]

@@ -96,7 +96,7 @@ def test_what_is_waited_for(
     made.reporter.tick(0)
     assert shown(made)[-1].texts["activity"] == words
     made.checkpointer.homeless = True
-    said = "waiting for the run folder, which is gone or another one"
+    said = "waiting for the run folder, which is gone or was replaced"
     assert made.reporter.flush(0).texts["activity"] == said
 
 

@@ -142,18 +142,18 @@ def test_touching_is_connected_and_figures_in_turns() -> None:
         (
             GAME,
             {"targets": "connected", "observe": "pictures", "pixels": 64},
-            "pictures tells at most 3 tokens .* got 7 in sim.targets=connected: set sim.targets",
+            "pictures can tell at most 3 .* got 7 with sim.targets=connected: set sim.targets",
         ),
         (
             layout_of("parallelogram", "parallelogram_mirrored"),
             SEEN,
-            "cannot tell parallelogram from parallelogram_mirrored, which may look alike: take ",
+            "cannot tell parallelogram from parallelogram_mirrored, which may look alike: give ",
         ),
         (layout_of("square", BOX), SEEN, "cannot tell square from box, which may look alike: "),
         (
             layout_of(BOX, BOX | {"corners": [[0, 0], [1, 0], [1, 2], [0, 2]]}),
             SEEN,
-            "takes tokens of one name for equal, and two of box have other corners: give them ",
+            "needs equal corners for tokens of one name, and two tokens box differ: give them ",
         ),
         (
             layout_of("square"),

@@ -177,7 +177,7 @@ def test_in_lockstep_a_player_with_other_environments_says_so() -> None:
         hub.order({0: Go(0, 0, 0, 6)})
         collect(hub, lambda _: hub.counters["byes"] == 1)
 
-    refusal = r"asks for 6 episodes, no multiple of service\.envs=4"
+    refusal = r"asks for 6 episodes, not a multiple of service\.envs=4"
     with pytest.raises(TangramError, match=refusal):
         with_master(hub, script, lambda: run_player(config(hub), made))
 
@@ -211,7 +211,7 @@ def test_a_signal_ends_a_player_with_a_goodbye(
     assert {n: signal.getsignal(n) for n in survivable_signals} == survivable_signals
     lines = [line.partition(" ")[2] for line in capfd.readouterr().err.splitlines()]
     assert [line for line in lines if "is behind" not in line] == [
-        f"player: joins {hub.endpoint}, waits 3600 s at most for its master",
+        f"player: joins {hub.endpoint}, waits at most 3600 s for its master",
         "player 0: joined run run",
         "player 0: waits: no weights yet",
         f"player 0: ends: {number.name}",
@@ -241,7 +241,9 @@ def test_a_player_whose_index_is_taken_goes_on_if_it_asked_for_none(
     )
     assert (found, status) == ([0] if index >= 0 else [0, 1], 0)
     # It may be told before its connection is gone, or when it comes again.
-    taken = r"player 0 was taken over by a newer process( \(.*\))?: it goes on with an index"
+    taken = (
+        r"player 0 was taken over by a newer process( \(.*\))?: this process joins again, with a"
+    )
     assert bool(re.search(taken, capfd.readouterr().err)) == (index < 0)
 
 

@@ -65,7 +65,7 @@ def test_no_master_in_time_says_where_none_is(tmp_path: Path, what: str) -> None
         "address": (endpoint, f"no master answers at {endpoint} after 0.2 s"),
         "file": (
             tmp_path,
-            f"no connection file is at {tmp_path} after 0.2 s, or none whose sockets are there",
+            f"no connection file is at {tmp_path} after 0.2 s, or its sockets do not exist",
         ),
     }[what]
     with make_client(connect, replace(QUICK, join_s=0.2)) as client:

@@ -151,7 +151,7 @@ def test_a_waiting_client_says_what_it_waits_for(
         assert text in caplog.text
 
     with make_client(tmp_path) as client:
-        until_said(client, client.join, f"waits for the connection file {tmp_path} since 0 s")
+        until_said(client, client.join, f"waits for the connection file {tmp_path}, 0 s so far")
     nobody = f"tcp://127.0.0.1:{free_ports(1)}"
     with make_client(nobody) as client:
         until_said(client, client.join, f"waits for an answer of the master at {nobody}")

@@ -16,7 +16,7 @@ from worker.talk.discovery import MasterAddress, await_master, find_master, host
 pytestmark = pytest.mark.fast
 
 REMEDY = (
-    "connect=... takes host:port, a run folder, or the connection.json that tangram-master "
+    "set connect=... to host:port, a run folder, or the connection.json that tangram-master "
     "writes into it"
 )
 
@@ -75,7 +75,7 @@ def test_a_host_that_is_unknown_says_where_its_name_comes_from(
     endpoint = "tcp://learner.lan:1"
     assert host_error(endpoint, "learner.lan:1") == "no such host: check the name in connect="
     assert host_error(endpoint, "runs/zz").startswith(
-        "no such host: it is the master's service.host and stands in runs/zz; start the master with"
+        "no such host: runs/zz has this name from the master's service.host; start the master with"
     )
 
 
@@ -96,7 +96,7 @@ def test_a_wrong_address_is_refused(address: str) -> None:
     with pytest.raises(RunError) as caught:
         find_master(address)
     assert str(caught.value) == (
-        f"'{address}' (from {address}) is no address: it must be tcp://host:port, the port "
+        f"'{address}' (from {address}) is no address: it must be tcp://host:port, with a port "
         "from 1 to 65535"
     )
 
@@ -115,14 +115,14 @@ def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
     ("content", "reason"),
     [
         ("", "it is not JSON)"),
-        ("[]", "its content is another one)"),
+        ("[]", "its values have the wrong types)"),
         ("{}", "it has no endpoint)"),
         ('{"endpoint": "tcp://h:1"}', "it has no run_id)"),
         ("[" * 100_000, "it is nested too deeply)"),
         (written(server_key="short"), "server_key must be a key, 40 characters of Z85)"),
-        (written(server_key=KEY), "it has a server_key, and no keys)"),
+        (written(server_key=KEY), "it has a server_key but no keys)"),
         (written(keys={"player": {"public": KEY, "secret": KEY}}), "server_key must be a key,"),
-        (written(keys=[]), "its content is another"),
+        (written(keys=[]), "its values have the wrong types"),
         (written(keys={"player": {}}), "it has no public)"),
         *(
             (
@@ -172,7 +172,7 @@ def test_a_file_that_comes_late_is_waited_for(tmp_path: Path) -> None:
         path.write_text(json.dumps({"endpoint": "tcp://h:1", "run_id": "r"}))
 
     assert await_master(str(path), tell, 60.0) == MasterAddress("tcp://h:1", "r")
-    assert told == [f"waits for the connection file {path}, for 60 s at most"]
+    assert told == [f"waits at most 60 s for the connection file {path}"]
     path.unlink()
     with pytest.raises(UnavailableError, match=r"no connection file is at .*c.json after 0.1 s"):
         await_master(str(path), lambda _: None, 0.1)
@@ -184,8 +184,8 @@ def test_a_run_that_has_ended_is_told_before_it_is_waited_for(tmp_path: Path) ->
     with pytest.raises(UnavailableError, match="no connection file is at"):
         await_master(str(tmp_path), told.append, 0.1)
     assert told == [
-        f"run {tmp_path.name} has ended, unless its master goes on with it: waits for the "
-        f"connection file {tmp_path}, for 0.1 s at most"
+        f"run {tmp_path.name} has ended, unless its master resumes it: waits at most 0.1 s for the "
+        f"connection file {tmp_path}"
     ]
 
 
@@ -209,7 +209,7 @@ def test_who_reads_a_file_makes_no_folder(tmp_path: Path, place: str) -> None:
     else:
         assert find_master(str(path)) is None
         with pytest.raises(
-            UnavailableError, match="or none whose sockets are there: is tangram-master"
+            UnavailableError, match="or its sockets do not exist: is tangram-master"
         ):
             await_master(str(path), lambda _: None, 0.1)
     assert not (tmp_path / "x").exists()

@@ -120,8 +120,8 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
         path = write_file(tmp_path, stage.hub, given)
         reason = turned_away(stage, path)
         assert reason == (
-            f"wrong or stale connection file: what answers at {stage.hub.endpoint} does not take "
-            f"the keys of {path}, of another run or revoked; take the file of a master that is "
+            f"wrong or stale connection file: the master at {stage.hub.endpoint} refuses the keys "
+            f"in {path}, which are of another run or revoked; use the file of a master that is "
             "running"
         )
         assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
@@ -144,7 +144,7 @@ def test_a_file_of_another_role_says_what_to_add() -> None:
 def test_an_address_alone_is_not_enough() -> None:
     with staged(keys=make_keys()) as stage:
         reason = turned_away(stage, stage.hub.endpoint)
-    assert "wants keys, or is none: name its connection file" in reason
+    assert "wants keys, or is no master: set connect to its connection file" in reason
 
 
 def test_a_file_that_becomes_right_is_read_again(tmp_path: Path) -> None:
@@ -271,8 +271,8 @@ def test_a_worker_on_another_machine_is_told_where_the_master_listens(tmp_path: 
     with pytest.raises(RunError) as caught:
         find_master(str(path))
     assert str(caught.value) == (
-        f"{path}: this master listens on its own machine, learner, only: start it there with "
-        "service.bind=0.0.0.0, or start this there"
+        f"{path}: this master listens only on its own machine, learner: start the master with "
+        "service.bind=0.0.0.0, or start this command on learner"
     )
     assert not (tmp_path / "t").exists()
 
@@ -325,7 +325,7 @@ def test_a_key_is_for_one_role_and_for_its_own_indices(tmp_path: Path, file: Pat
     with staged(keys=keys, audit=Audit(log)) as stage:
         one, other = raw(stage, keys, alice, b"the same"), raw(stage, keys, bob)
         answer = asked(stage, one, hello(role="evaluator"))
-        assert answer == Refused("the key 'alice' is one for role=player, not for role=evaluator")
+        assert answer == Refused("the key 'alice' is for role=player, not for role=evaluator")
         assert isinstance(asked(stage, one, hello(index=3)), Welcome)
         answer = asked(stage, other, hello(index=3, process="p2"))
         assert isinstance(answer, Refused)

@@ -49,7 +49,7 @@ def test_statistics_count_achieved_goals_beside_the_desired_one() -> None:
 def test_pictures_are_refused_by_name() -> None:
     pixels = Field("pixels", (4, 4, 3), 0, 255, dtype="u1")
     spec = EpisodeSpec(2, 1, (*SPEC.fields, pixels), "place", "goal")
-    with pytest.raises(ConfigError, match="field pixels of this task is u1"):
+    with pytest.raises(ConfigError, match="pixels of this task is u1"):
         Inputs.check(spec)
 
 

@@ -201,7 +201,7 @@ def test_losses_that_change_without_their_batch_are_refused_for_graphs() -> None
     for made in (steady, fading):
         made._whole = Whole(made.step, [p for own in made.lists.values() for p in own], False)
     steady.prepare()
-    with pytest.raises(ConfigError, match=r"Fading.losses: wanted the same.*compiles = False"):
+    with pytest.raises(ConfigError, match=r"Fading.losses: wanted equal losses.*compiles = False"):
         fading.prepare()
 
 

@@ -180,5 +180,5 @@ def test_values_are_for_outlines_alone() -> None:
     with pytest.raises(ConfigError, match="agent.kind=outline fills outlines: set task=fill, or"):
         replace(made, task=other.task)
     for shown in (other, setup(agent=SCENE)):
-        with pytest.raises(ConfigError, match=f"agent.kind={shown.agent_kind} plays tokens whose"):
+        with pytest.raises(ConfigError, match=f"agent.kind={shown.agent_kind} needs tokens"):
             replace(shown, task=made.task)

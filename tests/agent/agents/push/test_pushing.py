@@ -66,7 +66,7 @@ def test_it_keeps_the_promises_of_an_agent(task: Push) -> None:
 
 
 def test_it_learns_pushes_alone() -> None:
-    with pytest.raises(ConfigError, match="agent=push learns task=push alone, got task=place"):
+    with pytest.raises(ConfigError, match="agent=push learns only task=push, got task=place"):
         Pushing().check(setup(PAIR).task)
 
 
