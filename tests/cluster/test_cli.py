@@ -91,7 +91,7 @@ WRONG = [
     ("tangram-train -m seed=1 --cfg job", "--cfg and --multirun do not go together"),
     ("tangram-train seed", "cannot read 'seed': write name=value"),
     ("tangram-train tokens.shapes=[square", "cannot read 'tokens.shapes=[square'"),
-    ("tangram-train seed=1,2", "Ambiguous value for argument 'seed=1,2': a list is [1,2]"),
+    ("tangram-train seed=1,2", "Ambiguous value for argument 'seed=1,2': write [1,2] for a list"),
     ("tangram-train run_dir=${foo}", "cannot resolve the config: Interpolation key 'foo'"),
     (
         "tangram-train agent=best",
@@ -123,7 +123,7 @@ WRONG = [
         "depend on earlier ones: set task.fresh=true",
     ),
     ("tangram-master run_dir=/proc/tangram", "run_dir /proc/tangram cannot be made"),
-    ("tangram-worker", "say which run: connect=runs/..., or a"),
+    ("tangram-worker", "say which run: connect=runs/..., or connect= a copy"),
     ("tangram-worker connect=tcp://127.0.0.1:99999", "port from 1 to 65535"),
     ("tangram-status connect=tcp://127.0.0.1:65536", "port from 1 to 65535"),
     ("tangram-eval run_dir=pretrained/square puzzle=test", "puzzle 'trapezoid' has the pieces"),

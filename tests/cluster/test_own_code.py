@@ -264,7 +264,7 @@ def test_a_file_that_changed_before_its_copy_is_refused(tmp_path: Path) -> None:
     ("arguments", "told"),
     [
         (["task=own.py"], "task=own.py: name the class in it, as in task=path/to/file.py:Name"),
-        (["from_config=x.yaml", "--cfg", "job"], "--cfg shows presets and arguments alone"),
+        (["from_config=x.yaml", "--cfg", "job"], "--cfg shows presets and arguments only"),
         (["agent=pipe.py:A"], "it is no file"),
         (["agent=a.py:A,b.py:B"], "one file at a time: start a sweep for each"),
     ],

@@ -174,7 +174,7 @@ def test_the_ports_can_be_fixed_and_a_taken_one_is_named(tmp_path: Path) -> None
         found = (made.hub.endpoint, made.hub.weights_endpoint)
         assert [int(endpoint.rpartition(":")[2]) for endpoint in found] == [port, port + 1]
         for taken, asked in ((port, port), (port, port - 1)):
-            remedy = rf"port {taken} of .* is in use: choose another with service\.port="
+            remedy = rf"port {taken} of .* is in use: set service\.port to a number"
             with (
                 pytest.raises(ConfigError, match=remedy) as caught,
                 opened_run(tmp_path / str(asked), bind="127.0.0.1", port=asked),

@@ -244,7 +244,7 @@ def test_scores_are_taken_once_for_each_of_the_published_weights(
     dealers = [stage.dealer() for _ in range(3)]
     for number, dealer in enumerate(dealers):
         dealer.join(role="evaluator", process=f"p{number}")
-    unknown = "weights {} are none of the last 2 of this master"
+    unknown = "weights {} are not among the last 2 of this master"
     for published, index, version, reason in (
         (6, 0, 7, unknown.format(7)),
         (7, 0, 7, ""),

@@ -157,7 +157,7 @@ def test_a_waiting_client_says_what_it_waits_for(
         until_said(client, client.join, f"waits for an answer of the master at {nobody}")
     with welcomed(master, window=1) as client:
         client.send(episodes(), 0)
-        text = "waits for the master to take what was played since"
+        text = "waits for the master to take what was played"
         until_said(client, client.wait_for_window, text)
 
 
