@@ -1,5 +1,6 @@
-"""The studio: a web page to play on with the agent. `docs/studio.md` describes its design.
+"""The studio: a web page to play on with the agent.
 
-Start with `server.py` and `session.py`. May import tangram_game, worker, tangram_vision and what
+`server.py` serves the page and checks the token, `session.py` talks with one page, `jobs.py` runs
+searches and moves in two pools of processes. May import tangram_game, worker, tangram_vision and what
 these import; only this package serves pages.
 """
