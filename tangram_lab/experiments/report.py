@@ -116,7 +116,7 @@ def _curves(
     rows: pd.DataFrame,
     curves: pd.DataFrame,
 ) -> Canvas:
-    """Learning curves in two panels: mean over the seeds and one standard deviation."""
+    """Learning curves in two panels: median over the seeds, and a band from least to most."""
     canvas, panels = new_figure(4.2, 2, sharey=True)
     count = curves["episodes"]
     whole = curves.assign(job=count / max(figure.job, 1), simulations=count)
@@ -127,17 +127,17 @@ def _curves(
             every = [one.sort_values(x) for _, one in own.groupby("seed")]
             grid = np.linspace(0.0, min(one[x].max() for one in every), GRID)
             lines = np.stack([np.interp(grid, one[x], one[figure.measure]) for one in every])
-            middle, spread = lines.mean(axis=0), lines.std(axis=0)
+            least, middle, most = np.percentile(lines, (0, 50, 100), axis=0)
             panel.plot(grid, middle, color=colour, label=labels[name])
-            panel.fill_between(grid, middle - spread, middle + spread, color=colour, alpha=0.15)
+            panel.fill_between(grid, least, most, color=colour, alpha=0.15)
         text, linear = AXES[x]
         panel.set(xlabel=text, xlim=(0.0, None))
-        most = panel.get_xlim()[1]
-        if most > 10.0 * linear:
+        last = panel.get_xlim()[1]
+        if last > 10.0 * linear:
             panel.set_xscale("symlog", linthresh=linear)
             decades = 10.0 ** np.arange(1, 12)
             # Labels of smaller decades would overlap on the linear part of the axis.
-            panel.set_xticks([0.0, *decades[(decades >= linear) & (decades <= most)]])
+            panel.set_xticks([0.0, *decades[(decades >= linear) & (decades <= last)]])
         for (name, levels), dash in zip(figure.reported.items(), DASHES, strict=False):
             panel.axhline(levels[0], color="#111827", linestyle=dash, label=name)
         for policy, dash in RIVALS.items():
