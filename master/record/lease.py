@@ -1,7 +1,8 @@
 """A lease on a run folder, for network file systems where `flock` works on one machine only.
 
-The process that uses the folder keeps a file there with its host name and id, and touches the file
-every few seconds. All times come from the file system, so the clocks of machines may differ.
+The process that uses the folder keeps a file there with its host name, the boot id of its machine
+and an id of its own, and touches the file every few seconds. Whoever wants the folder watches the
+file for `STALE_S` by a clock that is never set, so no clock of the day decides.
 """
 
 import json
@@ -17,8 +18,9 @@ from tangram_core.errors import TangramError, UnavailableError
 from tangram_core.run.process import Every, still_alive, watching
 
 RENEW_S = 10.0
-STALE_S = 60.0  # a lease that was not renewed for this time may be taken over
+STALE_S = 60.0  # a lease that nobody renewed while it was watched for this time may be taken over
 LOOK_S = 1.0
+BOOT = Path("/proc/sys/kernel/random/boot_id")  # host names may be equal on several machines
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +33,7 @@ class Lease:
     """The lease of one process, which must hold the lock (`flock`) of the folder, too."""
 
     def __init__(self, path: Path) -> None:
-        """Take the lease; wait up to `STALE_S` if a process on another machine seems to have it.
+        """Take the lease; wait `STALE_S` if a process on another machine seems to have it.
 
         If the file cannot be written, a warning is logged and the process goes on without a lease.
 
@@ -39,7 +41,8 @@ class Lease:
             UnavailableError: a process on another machine uses the folder. It may belong to a job
                 that was requeued before it had ended.
         """
-        self._path, self._host, self._id = path, socket.gethostname(), secrets.token_hex(8)
+        self._path, self._id = path, secrets.token_hex(8)
+        self._host, self._machine = socket.gethostname(), BOOT.read_text().strip()
         self._aside = path.with_name(f"{path.name}.{self._id}")
         self._due, self._lost = Every(RENEW_S), ""
         try:
@@ -67,7 +70,7 @@ class Lease:
         """Delete the file if this process still has the lease."""
         watching.remove(self._keep)
         with suppress(OSError):
-            if self._holder()[1] == self._id:
+            if self._holder()[2] == self._id:
                 self._path.unlink()
 
     def _keep(self) -> None:
@@ -76,7 +79,7 @@ class Lease:
 
     def _renew(self) -> None:
         try:
-            host, holder = self._holder()
+            host, _, holder = self._holder()
         except FileNotFoundError:  # somebody deleted the file
             self._made()
             return
@@ -88,7 +91,8 @@ class Lease:
     def _made(self) -> bool:
         """Make the file; False if another process has one."""
         try:
-            self._aside.write_text(json.dumps({"host": self._host, "id": self._id}))
+            mine = {"host": self._host, "machine": self._machine, "id": self._id}
+            self._aside.write_text(json.dumps(mine))
             os.link(self._aside, self._path)  # atomic: no other process sees a partial file
         except FileExistsError:
             return False
@@ -97,15 +101,15 @@ class Lease:
         return True
 
     def _await_silence(self) -> os.stat_result:
-        """Wait until the holder's file is stale, and return the file's status.
+        """Watch the holder's file for `STALE_S`, and return the file's status.
 
         No wait for a holder on this machine: the lock shows that its process has ended.
         """
-        host, first = self._holder()[0], _fresh(self._path)
-        until_s = time.monotonic() + STALE_S - (self._now_s() - first.st_mtime)
-        if host != self._host and time.monotonic() < until_s:
+        (host, machine, _), first = self._holder(), _fresh(self._path)
+        until_s = time.monotonic() + STALE_S
+        if machine != self._machine:
             log.warning("waiting to see if a process on %s uses %s", host, self._path.parent)
-        while host != self._host and time.monotonic() < until_s:
+        while machine != self._machine and time.monotonic() < until_s:
             time.sleep(LOOK_S)
             still_alive()
             if _fresh(self._path).st_mtime != first.st_mtime:
@@ -123,20 +127,13 @@ class Lease:
             os.link(self._aside, self._path)
         self._aside.unlink()
 
-    def _now_s(self) -> float:
-        """The present time by the clock of the file system."""
-        self._aside.touch()
-        now_s = _fresh(self._aside).st_mtime
-        self._aside.unlink()
-        return now_s
-
-    def _holder(self) -> tuple[str, str]:
-        """Host and id in the file; this host and no id if a power cut damaged the content."""
+    def _holder(self) -> tuple[str, str, str]:
+        """Host, machine and id in the file; this machine and no id if a power cut damaged it."""
         try:
             found = json.loads(self._path.read_bytes())
-            return ascii(found["host"])[1:-1], str(found["id"])
-        except (ValueError, KeyError, TypeError, RecursionError):
-            return self._host, ""
+            return ascii(found["host"])[1:-1], str(found.get("machine")), str(found["id"])
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return self._host, self._machine, ""
 
 
 def _fresh(path: Path) -> os.stat_result:

@@ -235,7 +235,9 @@ class PushLearner(NetworkLearner):
         before, after = (tokens.placed(one) for one in (seen.at(seen.poses), scene))
         lost = (before & ~after & scene.present).scatter(1, pair, value=False).sum(1)
         there, placed = scene.present.gather(1, pair), after.gather(1, pair)
-        reward = (placed & there).sum(1) / there.sum(1) - 1.0 - _LOST * lost  # as in the task
+        reward = (
+            (placed & there).sum(1) / there.sum(1).clamp_min(1) - 1.0 - _LOST * lost
+        )  # as in the task
         goes_on = ~(placed | ~there).all(1)
         target = reward + config.gamma * goes_on * value.clamp(least, 0.0)
         return target.clamp(least, 0.0)

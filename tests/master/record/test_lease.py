@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from master.record import lease as lease_module
-from master.record.lease import Lease, LostError
+from master.record.lease import BOOT, Lease, LostError
 from master.record.rundir import LEASE, FolderError, RunFolder
 from tangram_core.errors import ConfigError, UnavailableError
 from tangram_core.run.process import still_alive
@@ -29,9 +29,10 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lease_module, "STALE_S", 0.2)
 
 
-def of_another(folder: Path, age_s: float = 0.0, host: str = "far") -> Path:
+def of_another(folder: Path, age_s: float = 0.0, host: str = "far", machine: str = "9") -> Path:
     path = folder / LEASE
-    path.write_text(json.dumps({"host": host, "id": "theirs"}) if host else "")
+    content = {"host": host, "machine": machine, "id": "theirs"}
+    path.write_text(json.dumps(content) if host else "")
     os.utime(path, (time.time() - age_s,) * 2)
     return path
 
@@ -53,10 +54,13 @@ def living(path: Path) -> Iterator[None]:
         thread.join()
 
 
-def test_a_process_of_another_machine_that_lives_keeps_its_folder(tmp_path: Path) -> None:
+@pytest.mark.parametrize("age_s", [0.0, 1000.0, -1000.0], ids=["now", "clock set on", "set back"])
+def test_a_process_of_another_machine_that_lives_keeps_its_folder(
+    age_s: float, tmp_path: Path
+) -> None:
     """Perhaps for no more than the moment in which its job ends, after it was queued again."""
-    path = of_another(tmp_path)
-    with living(path), pytest.raises(UnavailableError, match="by a process on far: choose another"):
+    path, host = of_another(tmp_path, age_s, socket.gethostname()), socket.gethostname()
+    with living(path), pytest.raises(UnavailableError, match=f"by a process on {host}: choose"):
         RunFolder(tmp_path).lock()
     with RunFolder(tmp_path).lock() as claim:  # which the one that was refused did not keep
         assert json.loads(path.read_text())["id"] != "theirs"
@@ -68,14 +72,25 @@ def test_a_process_of_another_machine_that_lives_keeps_its_folder(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("age_s", "host", "told"),
-    [(0.0, "far", 1), (1000.0, "far", 0), (0.0, socket.gethostname(), 0), (0.0, "", 0)],
-    ids=["silent", "long gone", "of this machine", "after a power cut"],
+    ("age_s", "host", "machine", "told"),
+    [
+        (0.0, "far", "9", 1),
+        (1000.0, "far", "9", 1),
+        (-1000.0, "far", "9", 1),
+        (0.0, "far", BOOT.read_text().strip(), 0),
+        (0.0, "", "", 0),
+    ],
+    ids=["silent", "long gone", "from the future", "of this machine", "after a power cut"],
 )
 def test_one_that_is_gone_leaves_its_folder(
-    age_s: float, host: str, told: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    age_s: float,
+    host: str,
+    machine: str,
+    told: int,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    path = of_another(tmp_path, age_s, host)
+    path = of_another(tmp_path, age_s, host, machine)
     with RunFolder(tmp_path).lock() as claim:
         assert json.loads(path.read_text())["id"] != "theirs"
         assert claim.check() is False

@@ -404,3 +404,12 @@ def learned_from(task: Push, monkeypatch: pytest.MonkeyPatch) -> tuple[PushLearn
         lambda *_: (torch.full((100, 1), -1.0), None, None),
     )
     return learner, learner.drawn(rng), found
+
+
+def test_a_pair_without_goals_on_the_table_has_a_finite_target(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No honest play shows one, but the bounds of what a worker may send allow it."""
+    learner, seen, _ = learned_from(SOME, monkeypatch)
+    seen = replace(seen, present=torch.zeros_like(seen.present))
+    assert torch.isfinite(learner._target(seen)).all()
