@@ -140,7 +140,7 @@ class Ledger:
         """As `judge`; a new batch is then held until `release`."""
         verdict = self.judge(sequence, window)
         if verdict is Verdict.NEW:
-            self.consume(sequence)
+            self.received, self.unused = sequence, False
             self.held.add(sequence)
         return verdict
 
@@ -151,8 +151,8 @@ class Ledger:
         return held
 
     def consume(self, sequence: int) -> None:
-        """Count the next batch as received without an insert, as when it is refused for good."""
-        self.received, self.unused = sequence, False
+        """Count the next batch as received, because it is refused for good."""
+        self.received = sequence
 
     def skip_to(self, sequence: int) -> int:
         """Expect this number next; returns how many batches before it were never received."""

@@ -72,7 +72,9 @@ def test_the_newest_process_of_an_index_wins_also_after_a_restart(registry: Regi
 def test_an_index_without_batches_leaves_nothing(registry: Registry) -> None:
     """A stranger who says HELLO and BYE for each index would fill the memory."""
     for index in range(9):
-        registry.leave(admitted(registry, f"a{index}", index=index))
+        stranger = admitted(registry, f"a{index}", index=index)
+        stranger.ledger.consume(1)  # a batch that is refused for good
+        registry.leave(stranger)
     assert registry.state() == {}
     assert admitted(registry, "b", index=3).incarnation == 1
     # Where there was one in an earlier incarnation the number must not come again.
