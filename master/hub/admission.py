@@ -105,6 +105,7 @@ class Admission:
         for holder in self._sockets.revoked():
             for peer in [one for one in self.registry.peers if one.holder == holder.name]:
                 self.revoke(peer.identity, holder.name)
+            self.registry.forget(holder.name)
 
     def revoke(self, identity: bytes, key: str) -> None:
         """Refuse a connection whose key was revoked, and remove its peer if there is one."""

@@ -204,6 +204,11 @@ class Registry:
         if peer.ledger.unused and self._ledgers.get(peer.key) is peer.ledger:
             del self._ledgers[peer.key]
 
+    def forget(self, owner: str) -> None:
+        """Free all indices of a key that was revoked: nobody can come back with it."""
+        for key in [key for key, one in self._ledgers.items() if one.owner == owner]:
+            del self._ledgers[key]
+
     def drop_silent(self, now: float, silence_s: float) -> list[Peer]:
         """Remove and return the peers that sent no message for `silence_s` seconds."""
         silent = [p for p in self._by_key.values() if now - p.last_seen > silence_s]

@@ -262,6 +262,16 @@ def test_after_a_restart_an_incarnation_belongs_to_the_process_that_used_it(
     assert (again.incarnation, again.ledger.inserted) == (1, 1)
 
 
+def test_the_indices_of_a_revoked_key_are_free_again(registry: Registry) -> None:
+    """One key could have had all of them."""
+    for owner, index in (("mallory", 0), ("mallory", 1), ("alice", 2)):
+        registry.recover(("player", index), 1, 1, 0.0, owner, owner)
+    registry.forget("mallory")
+    assert list(registry.state()) == ["player/2"]
+    later = 2.0 * GRACE_S
+    assert registry.admit(b"own", hello(process="own"), later, "player")[0].index == 0
+
+
 @pytest.mark.parametrize("kept", ["in the journal", "in a checkpoint", "live"])
 def test_an_index_stays_with_the_key_that_had_it_first(registry: Registry, kept: str) -> None:
     """Process, index and incarnation can be read in the run's folder; they prove nothing."""
