@@ -101,6 +101,7 @@ class Launcher:
         self._look = Every(IDLE_S)
         self._stop_s: float | None = None
         self._signalled_s: float | None = None
+        self._killed_by = 0  # the signal that ended everything at once
         self._failed, self._sent_home = False, False
         self._reached = False  # since its last start, the master has been reachable at some time
 
@@ -202,6 +203,7 @@ class Launcher:
         if self._stop_s is None:
             self._stop(stop_notice(number.name), number)
         elif now_s - self._signalled_s >= SAME_WISH_S:
+            self._killed_by = number.value
             self._kill_all()
 
     def _kill_all(self) -> None:
@@ -239,6 +241,8 @@ class Launcher:
             self._say(f"the master ended with {describe(status)}; {GO_ON}")
         if self._failed:
             return FAILED_STATUS
+        if self._killed_by:
+            return 128 + self._killed_by
         return 128 - status if status < 0 else status
 
     def _worker_ended(self, child: Child) -> None:
