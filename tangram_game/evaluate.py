@@ -26,7 +26,6 @@ from tangram_game.scores import (
     RUN,
     Scores,
     of_each,
-    of_outlines,
     of_several,
     score_puzzles,
 )
@@ -104,8 +103,6 @@ def _scored(tests: FixedTests, player: Player) -> Scores:
         ended = whole.episodes.terminated.cumsum(axis=1) - whole.episodes.terminated
         return scores | {"ms_per_choice": 1e3 * float(whole.chose.sum() / (ended == 0).sum())}
     played = Played.of(whole)
-    if task.outlines:
-        return scores | of_outlines(task, played)
     several = task.layout.tokens > 1
     return scores | (of_several(played) if several else of_each(played))
 

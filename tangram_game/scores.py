@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats
+from tangram_core.arrays import Floats
 from tangram_game.figures.puzzles import Figure, Player, play_figures
-from tangram_sim.rewards import scaled_overlap
-from tangram_tasks.metrics import SOLVED, Assembled, assembled, pose_errors, summarise
+from tangram_tasks.metrics import Assembled, assembled, pose_errors, summarise
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 
@@ -59,24 +58,10 @@ def score_puzzles(
 
 
 def _of_puzzles(task: Place, played: Played) -> Scores:
-    if task.outlines:
-        return of_outlines(task, played)
-    own: Scores = {**summarise(task.layout, task.sim, played, own_reward=False)}
+    """The scores that the task declares."""
+    every = summarise(task.layout, task.sim, played, own_reward=False, outlines=task.outlines)
+    own: Scores = {one.name: every[one.name] for one in task.scores if one.name in every}
     return own | {"episodes": float(len(played.overlap))} | of_several(played)
-
-
-def of_outlines(task: Place, played: Played) -> Scores:
-    """Scores of filled outlines, without scores of single pieces: any dissection counts."""
-    found = assembled(task.layout, played)
-    return _of_areas(found) | {"episodes": float(len(found.iou))} | of_several(played)
-
-
-def _of_areas(found: Assembled) -> Scores:
-    """Mean scores of areas and actions, without those of single pieces."""
-    means = {name: float(np.mean(getattr(found, name))) for name in (*_SHARES, *_ACTIONS)}
-    reward = float(np.mean(scaled_overlap(found.coverage)))
-    solved = float(np.mean(found.iou >= SOLVED))
-    return means | {"mean_reward": reward, "solved": solved}
 
 
 def of_each(played: Played) -> Scores:
@@ -94,11 +79,10 @@ def of_several(played: Played) -> Scores:
 
 
 def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
-    found = assembled(task.layout, played)
-    solved = found.iou >= SOLVED if task.outlines else found.solved
+    found = assembled(task.layout, played, task.outlines)
     counts = (*(() if task.outlines else _PIECES), *_ACTIONS)
     lines = [
-        _line(figure, found, e, solved, counts) | {"seconds": float(played.seconds[e])}
+        _line(figure, found, e, counts) | {"seconds": float(played.seconds[e])}
         for e, figure in enumerate(figures)
     ]
     if task.outlines:
@@ -110,14 +94,12 @@ def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[
     ]
 
 
-def _line(
-    figure: Figure, found: Assembled, e: int, solved: Bools, counts: Sequence[str]
-) -> dict[str, Any]:
-    """Scores of puzzle number `e`, with the named counts; `solved` (E,)."""
+def _line(figure: Figure, found: Assembled, e: int, counts: Sequence[str]) -> dict[str, Any]:
+    """Scores of puzzle number `e`, with the named counts."""
     return {
         "name": figure.name,
         "degrees": figure.degrees,
         **{name: float(getattr(found, name)[e]) for name in _SHARES},
-        "solved": bool(solved[e]),
+        "solved": bool(found.solved[e]),
         **{name: int(getattr(found, name)[e]) for name in counts},
     }

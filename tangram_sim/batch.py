@@ -37,7 +37,7 @@ class StepResult:
 
     Attributes:
         rewards: (B,) by the configured reward function.
-        overlap: (B,) raw overlap in [0, 1] on exact polygons.
+        overlap: (B,) coverage in [0, 1] on exact polygons.
         camera_rewards: (B,) rewards by Eq. 14 on the pictures; None with the camera off.
         refused: (B,) whether the action named a placed token; then nothing moved.
         blocked: (B,) whether the token would have covered others too much; then nothing moved.
@@ -302,7 +302,7 @@ class BatchedEnv:
         return self._targets.rewards(self.pictures)
 
     def _rewards(self, share: Floats, camera: Floats | None) -> Floats:
-        """(B,) configured rewards, given the raw overlap and the rewards from pictures."""
+        """(B,) configured rewards, given the coverage and the rewards from pictures."""
         observed = self._reward.source == "camera" or self.sight is not None
         if camera is not None and observed and self._reward.name == "overlap":
             return camera

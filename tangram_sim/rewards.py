@@ -89,7 +89,7 @@ def _shown(achieved: Floats, desired: Floats, layout: Layout, width: float) -> F
 
 
 def scaled_overlap(share: Floats) -> Floats:
-    """The reward (B,) in [-1, 1] for a raw overlap (B,) in [0, 1]."""
+    """The reward (B,) in [-1, 1] for a coverage (B,) in [0, 1]."""
     return 2.0 * share - 1.0
 
 

@@ -39,12 +39,15 @@ def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Fl
     return position, np.where(pairing.other_side, largest, turn)
 
 
-def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) -> dict[str, float]:
+def summarise(
+    layout: Layout, sim: SimConfig, played: Played, own_reward: bool, outlines: bool = False
+) -> dict[str, float]:
     """Scores of E episodes; percentiles are taken at the worse end.
 
     Args:
         own_reward: also report the mean reward of the last action, if training uses another reward
             than Eq. 14 of exact polygons.
+        outlines: see `assembled`.
 
     Returns:
         mean_reward (always Eq. 14 of exact polygons, in [-1, 1]), mean_reward_dense (Eq. 15),
@@ -71,7 +74,7 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
             np.mean(played.episodes.rewards[:, -1], dtype=np.float64)
         )
     if layout.tokens > 1:
-        scores |= assembled(layout, played).means()
+        scores |= assembled(layout, played, outlines).means()
     return scores
 
 
@@ -82,6 +85,7 @@ class Assembled:
     Attributes:
         coverage: (E,) share of the target that the tokens cover, in [0, 1].
         iou: (E,) intersection over union of tokens and target, in [0, 1].
+        solved: (E,) whether the target is reached, see `assembled`.
         wrong: (E,) pieces of the target that a token of another shape covers most, and by more
             than `TOUCHED`; a chiral token on its other side counts as another shape.
         doubly_used: (E,) pieces that two or more tokens cover by more than `USED` each.
@@ -92,32 +96,31 @@ class Assembled:
 
     coverage: Floats
     iou: Floats
+    solved: Bools
     wrong: Ints
     doubly_used: Ints
     refused: Ints
     blocked: Ints
     actions_used: Ints
 
-    @property
-    def solved(self) -> Bools:
-        """(E,) where at least `SOLVED` of the target is covered."""
-        solved: Bools = self.coverage >= SOLVED
-        return solved
-
     def means(self) -> dict[str, float]:
         """Each score's mean over the episodes."""
-        means = {name: float(np.mean(column)) for name, column in vars(self).items()}
-        return means | {"solved": float(np.mean(self.solved))}
+        return {name: float(np.mean(column)) for name, column in vars(self).items()}
 
 
-def assembled(layout: Layout, played: Played) -> Assembled:
-    """Scores of the figures at the end of played episodes."""
+def assembled(layout: Layout, played: Played, outlines: bool = False) -> Assembled:
+    """Scores of the figures at the end of played episodes.
+
+    A target is reached from a coverage of `SOLVED` on, an outline from an IoU of `SOLVED` on.
+    """
     coverage = covered_share(played.ends, played.goals, layout)
+    shares = iou(layout, played.ends, coverage)
     covered = covered_shares(layout, played.ends, played.goals)
     refused = played.refused.sum(axis=1)
     return Assembled(
         coverage=coverage,
-        iou=iou(layout, played.ends, coverage),
+        iou=shares,
+        solved=(shares if outlines else coverage) >= SOLVED,
         wrong=_wrong(layout, played, covered),
         doubly_used=((covered > USED + _ROUNDING).sum(axis=2) > 1).sum(axis=1),
         refused=refused,

@@ -132,10 +132,10 @@ class Place(Task):
         from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
 
         own = (self.reward.name, self.reward.source) != ("overlap", "polygon")
-        return summarise(self.layout, self.sim, PlayedTokens.of(played), own)
+        return summarise(self.layout, self.sim, PlayedTokens.of(played), own, self.outlines)
 
     def draw(self, played: Played) -> Pixels:
-        """Draw how the first episodes ended, each with its overlap."""
+        """Draw how the first episodes ended, each with its coverage."""
         from tangram_sim.drawing.scenes import episode_sheet  # noqa: PLC0415
         from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
 

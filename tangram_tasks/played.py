@@ -36,7 +36,7 @@ class Played:
         episodes: corners and goals as the policy saw them, its actions and their rewards.
         corners: (E, T + 1, V, 2) exact corners, before each step and after the last.
         goals: (E, V, 2) exact corners of the targets.
-        overlap: (E,) raw overlap of exact polygons after the last step.
+        overlap: (E,) coverage of exact polygons after the last step.
         refused: (E, T) whether the action chose a placed token.
         blocked: (E, T) whether a token could not be set down because it would lie on others.
         seconds: (E,) wall time of choosing and moving; episodes played together share it equally.

@@ -46,9 +46,8 @@ class Show:
     def told(self) -> str:
         """Number of episodes, mean score and note, as one line of text."""
         mean = float(self.played.overlap.mean())
-        score = "raw overlap" if self.kind == "episode" else "coverage"
         note = f"; {self.note}" if self.note else ""
-        return f"{plural(len(self.titles), self.kind)}, {score} {mean:.3f}{note}"
+        return f"{plural(len(self.titles), self.kind)}, coverage {mean:.3f}{note}"
 
 
 def frames_per_action(horizon: int) -> int:

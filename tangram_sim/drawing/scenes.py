@@ -37,7 +37,7 @@ _PALETTE_FRAMES = 40  # frames from which the colours of a GIF are chosen
 _GHOST = 0.18  # opacity of a token where it started
 SMALLEST_TEXT = 9  # pixels
 START, WAY, END, GOAL = MARKS = ("start", "way", "end", "target")
-MEANING = ("overlap: covered share", "of the target, 1 is all of it")
+MEANING = ("coverage: covered share", "of the target, 1 is all of it")
 
 
 def draw_scene(
@@ -97,7 +97,7 @@ def episode_sheet(
         for start, end, goal in zip(starts, ends, goals, strict=True)
     ]
     covered = covered_share(ends, goals, layout) if shares is None else shares
-    captions = [f"overlap  {share:.3f}" for share in covered]
+    captions = [f"coverage  {share:.3f}" for share in covered]
     sheet = contact_sheet(scenes, columns, captions)
     return with_legend(sheet, max(size // 18, SMALLEST_TEXT))
 

@@ -165,7 +165,7 @@ def _box(polygons: Floats) -> tuple[Floats, Floats]:
 
 
 def covered_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
-    """Raw overlap (B,) in [0, 1]: the covered share of the target's area."""
+    """Coverage (B,) in [0, 1]: the covered share of the target's area."""
     whole = layout.areas.sum()
     share: Floats = np.clip(overlap_area(tokens, targets, layout) / whole, 0.0, 1.0)
     return share

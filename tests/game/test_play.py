@@ -139,7 +139,7 @@ def test_an_animation_has_frames_that_move(
         first = np.asarray(film.convert("RGB"))
         film.seek(film.n_frames - 1)
         assert (np.asarray(film.convert("RGB")) != first).any()
-    assert f"{out}: 2 episodes, raw overlap 0." in capsys.readouterr().out
+    assert f"{out}: 2 episodes, coverage 0." in capsys.readouterr().out
     assert list(tmp_path.glob(".film*")) == []
 
 
@@ -207,7 +207,7 @@ def test_unknown_and_too_many_puzzles(tmp_path: Path, monkeypatch: pytest.Monkey
     ("what", "told"),
     [
         ({"puzzle": ("cat", "dog")}, "2 puzzles, coverage 0."),
-        ({"episodes": 2}, "2 episodes, raw overlap 0."),
+        ({"episodes": 2}, "2 episodes, coverage 0."),
     ],
 )
 def test_a_picture_of_several_tokens_shows_the_ends(

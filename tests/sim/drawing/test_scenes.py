@@ -104,7 +104,7 @@ def test_a_legend_below_the_sheet_tells_start_way_end_target_and_number(
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda *given, **_: words.append(given[2]))
     sheet = with_legend(Image.new("RGB", (width, 50), "white"), 10)
     assert words[:4] == ["start", "way", "end", "target"]
-    assert " ".join(words[4:]) == "overlap: covered share of the target, 1 is all of it"
+    assert " ".join(words[4:]) == "coverage: covered share of the target, 1 is all of it"
     assert sheet.height == 50 + 15 * lines + 5
     assert (sheet.width == width) == (lines < 4)
     marks = np.asarray(sheet, int)[50:].reshape(-1, 3)

@@ -169,6 +169,9 @@ def test_covered_at_95_per_cent_is_solved() -> None:
     for e, missing in enumerate((0.1 - 1e-6, 0.1 + 1e-6)):  # of one of two squares of side 0.4
         ends[e, :4, 0] += 0.4 * missing
     assert over(layout, ends, goals).solved.tolist() == [True, False]
+    # An outline is solved by its IoU, which is .905 here.
+    played = ended(layout, np.stack([goals, ends], axis=1), goals)
+    assert assembled(layout, played, outlines=True).solved.tolist() == [False, False]
 
 
 # Errors of pose, and the scores of a set

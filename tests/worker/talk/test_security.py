@@ -383,6 +383,7 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
         with make_client(path) as client:
             assert served(stage, client.join)
             assert isinstance(asked(stage, end, hello(process="bob")), Welcome)
+            stage.hub._registry.recover(("player", 7), 1, 1, 0.0, "before", "bob")
 
             def publish() -> None:
                 stage.hub.publish(weights(version=stage.hub.counters["published"] + 1))
@@ -405,6 +406,7 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
             told = decode_from_master(end.recv_multipart(), None)
             assert told == Stop("the key bob was revoked")
             assert [peer.holder for peer in stage.hub.peers] == ["player"]
+            assert "player/7" not in stage.hub.state()  # bob's index is free again
             assert asked(stage, end, Heartbeat({})) == told
             while beside.poll(100):  # what was on its way
                 beside.recv()
