@@ -27,7 +27,6 @@ from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of, with_usual_agent
 from conf.own import with_named_code, without_named_code
 from tangram_core.errors import (
-    UNAVAILABLE_STATUS,
     USAGE_STATUS,
     ConfigError,
     TangramError,
@@ -100,7 +99,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         # The user's input may hold line breaks and control characters of the terminal.
         line = CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(error))
         print(f"{command}: {line}", file=sys.stderr)
-        return UNAVAILABLE_STATUS if isinstance(error, UnavailableError) else USAGE_STATUS
+        return error.status
     finally:
         gc.enable()
 
@@ -213,7 +212,7 @@ def _as_ours(error: Exception) -> TangramError:
     """An error of disk, permission or memory as a TangramError with a remedy."""
     kind = UnavailableError if is_passing(error) else TangramError
     if isinstance(error, TangramError):
-        return kind(str(error))
+        return UnavailableError(str(error)) if kind is UnavailableError else error
     if isinstance(error, OSError):
         return kind(
             f"cannot use {error.filename or 'a file'} ({error.strerror or error}): make room or "

@@ -14,7 +14,7 @@ from threading import Thread
 import psutil
 
 from master.forking import Body, run_command, start
-from tangram_core.errors import UNAVAILABLE_STATUS, USAGE_STATUS
+from tangram_core.errors import FAILED_STATUS, UNAVAILABLE_STATUS, USAGE_STATUS
 from tangram_core.run.process import Lifeline
 
 # After a life of this length, earlier restarts are not counted.
@@ -23,7 +23,6 @@ MAX_RESTARTS = 5
 FIRST_DELAY_S = 0.5
 MAX_DELAY_S = 30.0
 MAX_WAIT_S = 300.0  # for something that the environment lacks; these restarts have no limit
-HUNG_STATUS = 1  # exit status of a watchdog; other failures have it, too
 TAIL_LINES = 12
 
 
@@ -105,7 +104,7 @@ class Child:
         """
         now_s = time.monotonic()
         # A process that hung from the start still lives until its watchdog ends it.
-        hung = status == HUNG_STATUS or self._frozen_s > 0.0
+        hung = status == FAILED_STATUS or self._frozen_s > 0.0
         if now_s - self._started_s >= STEADY_S + (self.patience_s if hung else 0.0):
             self.restarts, self.wait_s = 0, 0.0
         if status == UNAVAILABLE_STATUS:

@@ -19,7 +19,13 @@ from master.record.rundir import LAUNCHER, RunFolder
 from master.signals import SAME_WISH_S, SIGNALS, show_cursor, stop_notice
 from master.watch.console import logging_to, sturdy_console
 from master.watch.result import show_finished
-from tangram_core.errors import UNAVAILABLE_STATUS, USAGE_STATUS, UnavailableError
+from tangram_core.errors import (
+    FAILED_STATUS,
+    UNAVAILABLE_STATUS,
+    USAGE_STATUS,
+    RunError,
+    UnavailableError,
+)
 from tangram_core.run.code import code_of, override
 from tangram_core.run.outcome import CTRL_C
 from tangram_core.run.process import WATCHDOG_S, Every, handling, watch_parent
@@ -31,7 +37,6 @@ IDLE_S = 1.0
 # After a signal the master has this time to write its checkpoint and its result.
 STOP_S = 120.0
 LEAVE_S = 8.0
-FAILED_STATUS = 1
 TAKE_BACK_S = 30.0
 PLAYER_NICE = 5
 EVALUATOR_NICE = 10
@@ -221,8 +226,9 @@ class Launcher:
         if status == 0 or self._stop_s is not None or not self._master.plan_restart(status):
             return False
         # A worker that starts now must not connect to the address of the dead master.
-        with suppress(OSError):  # the disk failed
+        with suppress(OSError, RunError):  # the disk failed
             self._folder.connection.unlink(missing_ok=True)
+            self._folder.write_again()  # the settings, if somebody deleted them
         self._reached = False
         self._master.arguments = [
             "resume=auto" if text.startswith("resume=") else text for text in self._master.arguments

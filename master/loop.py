@@ -2,7 +2,6 @@
 
 import logging
 import time
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 from master.checkpointer import Checkpointer
@@ -15,7 +14,7 @@ from master.record.delivery import EpisodesArrived, ScoresArrived
 from master.record.rundir import Clock, FolderError, RunFolder
 from master.signals import StopSignals, stop_notice
 from master.watch.report import Reporter
-from tangram_core.errors import RunError
+from tangram_core.errors import FailedError
 from tangram_core.run.process import Every, Watchdog
 from tangram_core.run.service import ServiceConfig
 from tangram_core.wire.messages import RunStatus
@@ -171,6 +170,7 @@ class Loop:
             The status of the run at its end.
 
         Raises:
+            FailedError: the run folder is gone, or the weights are not finite.
             RunError: the disk is full.
         """
         if self.signals.reason is not None and not launched:  # else tangram-train has shown it
@@ -181,7 +181,7 @@ class Loop:
         try:
             self.checkpointer.save()
         except FolderError as error:
-            raise RunError(
+            raise FailedError(
                 f"{error}: the run ended without a checkpoint, and all since the last one is lost; "
                 "if you have a copy of the folder, go on from there with resume=auto"
             ) from None
@@ -193,8 +193,7 @@ class Loop:
         """Tell all peers to end, and wait up to `LEAVE_S` for them to leave."""
         self._dismissed = True
         # First: while this file exists, new workers join and tangram-train restarts the old ones.
-        with suppress(OSError):  # the disk failed
-            self.folder.connection.unlink()
+        self.folder.remove_connection()
         until_s = time.monotonic() + LEAVE_S
         self.hub.stop(reason)
         while self.hub.peers and time.monotonic() < until_s:

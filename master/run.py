@@ -157,7 +157,8 @@ def open_run(
     _insert_again(batches, hub, guard, budget, lockstep, watchdog)
     after = Place((rest.place or Place()).segment, batches.number)
     sync_s = service.journal_sync_seconds
-    journal = Journal(folder.journal, run_id, digest, sync_s, after)
+    # What is harmed is read no more: a checkpoint is due at once.
+    journal = Journal(folder.journal, run_id, digest, sync_s, after, exposed=batches.harmed)
     opened.enter_context(closing(journal))
     if config.resume == "auto" and (found or trainer.episodes):
         log.info("goes on after %s updates", f"{trainer.updates:,}")
@@ -275,5 +276,6 @@ def _insert_again(
                 watchdog.progress()
                 guard.update(budget.share)
         trainer.insert(batch.episodes)
+    hub.recovered()
     if trainer.episodes > before:
         log.info("%s episodes restored from the journal", f"{trainer.episodes - before:,}")

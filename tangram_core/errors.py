@@ -1,7 +1,7 @@
 """Errors that are shown without a traceback.
 
 Commands print an error as one line, so each message names the value, the bound and a remedy. The
-exit status tells the cause: 2 is the user's input, 75 is the environment.
+exit status tells the cause: 1 is a run that failed, 2 the user's input, 75 the environment.
 """
 
 import os
@@ -17,13 +17,19 @@ UNREADABLE = (
     OverflowError,
     RecursionError,
 )
-USAGE_STATUS, UNAVAILABLE_STATUS = 2, os.EX_TEMPFAIL
+FAILED_STATUS, USAGE_STATUS, UNAVAILABLE_STATUS = 1, 2, os.EX_TEMPFAIL
 # A disk that is full or fails, no memory, too many open files, a port in use.
 PASSING = (ENOSPC, EDQUOT, EIO, EROFS, ESTALE, ENOMEM, EMFILE, ENFILE, EADDRINUSE)
 
 
 class TangramError(Exception):
-    """Base of every error that is shown to the user without a traceback."""
+    """Base of every error that is shown to the user without a traceback.
+
+    Attributes:
+        status: exit status of a command that ends with this error.
+    """
+
+    status = USAGE_STATUS
 
 
 class ConfigError(TangramError):
@@ -36,6 +42,14 @@ class OwnCodeError(ConfigError):
 
 class UnavailableError(TangramError):
     """The environment lacks something for now, such as disk space: try again later."""
+
+    status = UNAVAILABLE_STATUS
+
+
+class FailedError(TangramError):
+    """A run that cannot go on as it is, such as one that diverged."""
+
+    status = FAILED_STATUS
 
 
 class SamplingError(TangramError):

@@ -23,6 +23,7 @@ from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.base.config import RelabelConfig
 from tangram_core.errors import (
     ConfigError,
+    FailedError,
     OwnCodeError,
     RunError,
     TangramError,
@@ -422,6 +423,7 @@ LOWER = "lower agent.replay_capacity, agent.batch_size or service.envs"
     [
         (TangramError("port 5 is too large"), 2, "port 5 is too large"),
         (UnavailableError("port 5 is taken"), 75, "port 5 is taken"),
+        (FailedError("it diverged"), 1, "it diverged"),
         (MemoryError("4 GiB"), 75, f"not enough memory (4 GiB): {LOWER}"),
         *(
             (OSError(getattr(errno, name), "no", "/x"), status, f"cannot use /x (no): {ROOM}")

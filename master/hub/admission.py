@@ -76,10 +76,14 @@ class Admission:
             self._audit.note("refused", **who, **where)
             self._sockets.refuse(identity, error.counter, error.answer)
             return None
-        if older is not None:
+        if older is not None and older.key == peer.key:
             reason = f"{peer.name} {TAKEN_OVER}"
             self._tell_of("superseded", older, reason)
             self._sockets.refuse(older.identity, "superseded", Stop(reason))
+        elif older is not None:
+            reason = f"{older.name} made place: '{older.holder}' has more processes than others"
+            self._tell_of("refused", older, reason)
+            self._sockets.refuse(older.identity, "refused_full", Refused(reason, later=True))
         before, peer.address, peer.holder = peer.address, address, caller.name
         if before is None:
             self._tell_of("joined", peer)
@@ -102,10 +106,16 @@ class Admission:
 
     def drop_revoked(self) -> None:
         """Remove the peers whose keys were revoked since the last call."""
-        for holder in self._sockets.revoked():
+        for holder in (gone := self._sockets.revoked()):
             for peer in [one for one in self.registry.peers if one.holder == holder.name]:
                 self.revoke(peer.identity, holder.name)
-            self.registry.forget(holder.name)
+        if gone:
+            self.free_revoked()
+
+    def free_revoked(self) -> None:
+        """Free the indices of keys that are not in the key file any more."""
+        keys = self._sockets.keys
+        self.registry.free_all_but(() if keys is None else (*ROLES, *keys.given))
 
     def revoke(self, identity: bytes, key: str) -> None:
         """Refuse a connection whose key was revoked, and remove its peer if there is one."""

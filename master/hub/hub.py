@@ -16,7 +16,7 @@ from typing import Self
 from master.hub.admission import Admission, WelcomeInfo
 from master.hub.fair import FairQueue
 from master.hub.gate import AMPLE, Room
-from master.hub.registry import Askers, Peer
+from master.hub.registry import OWN, Askers, Peer
 from master.hub.security import Holder, Keys
 from master.hub.sockets import Received, Sockets
 from master.record.audit import Audit
@@ -208,6 +208,10 @@ class Hub:
         sent, by = (arrival.incarnation, arrival.sequence), (arrival.process, arrival.owner)
         return self._registry.recover(key, *sent, time.monotonic(), *by)
 
+    def recovered(self) -> None:
+        """Call after the last `recover`: the indices of revoked keys are free."""
+        self._admission.free_revoked()
+
     def close(self) -> None:
         """Close the sockets; queued answers get one second to be sent."""
         self._sockets.close()
@@ -330,13 +334,19 @@ class Hub:
         return None
 
     def _scores(self, peer: Peer, scores: Scores) -> ScoresArrived | None:
-        """Check scores: an evaluator may score each published version of the weights once."""
+        """Check scores: an evaluator may score each published version of the weights once.
+
+        One with the key of another user is heard only if the run has no evaluator of its own.
+        """
         odd = scores.scalars.keys() - self._info.scores - set(COUNTS)
         if odd:
             self._reject(peer, 0, f"scores: the task has no score named {min(odd)}")
             return None
         peer.damaged = 0
-        if reason := self._exams.take(scores.weights_version, peer.index):
+        if peer.holder not in OWN and self._registry.has_own("evaluator"):
+            self._reject(peer, 0, "the run's own evaluator scores the weights", "excess_scores")
+            return None
+        if reason := self._exams.take(scores.weights_version, peer.index, peer.holder):
             self._reject(peer, 0, reason, "excess_scores")
             return None
         self.counters["scores"] += 1

@@ -5,24 +5,29 @@ the older process. A process that reconnects after a restart of the master keeps
 the master has lost that number (in a power cut), the process gets the next one. A process can keep
 only an incarnation that a master gave. An index stays with the first key that had it: no other key
 may continue its batches or start there again.
+
+No key keeps the others out: in a full room, the key with the most processes makes place.
 """
 
 import logging
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-from master.hub.gate import AMPLE, Room
+from master.hub.gate import AMPLE, MAX_PEERS, Room
 from master.record.delivery import EpisodesArrived, Ledger
 from tangram_core.errors import RunError, TangramError
 from tangram_core.wire.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_core.wire.schema import MAX_COUNT
 
 CROWDED = 0.9  # a warning is logged when this share of the room is taken
+MAX_INDICES = MAX_PEERS  # of one key of another user
 # A peer that asks again for weights and does not show that it got them waits so long, then twice.
 WEIGHTS_AGAIN_S = 10.0
 # Status answers to one key in STATUS_AGAIN_S: so many in all, and one for each connection.
 STATUS_ANSWERS, STATUS_AGAIN_S = 64, 0.5
 ANOTHER_KEY = "takes part with another key: leave index out, or choose another"
+OWN = ("", *ROLES)  # names of the run's own keys, and of no key
 Key = tuple[str, int]
 
 log = logging.getLogger(__name__)
@@ -135,6 +140,10 @@ class Registry:
         """Number of connected peers with a role."""
         return sum(one == role for one, _ in self._by_key)
 
+    def has_own(self, role: str) -> bool:
+        """Whether a peer with this role has one of the run's own keys."""
+        return any(one.role == role and one.holder in OWN for one in self._by_key.values())
+
     def find(self, identity: bytes) -> Peer | None:
         """The peer of a connection, or None."""
         return self._by_identity.get(identity)
@@ -153,6 +162,8 @@ class Registry:
     ) -> tuple[Peer, Peer | None]:
         """Admit a process; a new process replaces an older one with the same index.
 
+        In a full room it replaces one of the key with the most processes.
+
         Args:
             identity: of the connection.
             hello: message of the process.
@@ -160,7 +171,7 @@ class Registry:
             owner: name of the process's key.
 
         Returns:
-            The peer, and the older peer that had the index, or None.
+            The peer, and the older peer that left for it, or None.
 
         Raises:
             RefusedError: the settings differ, there are too many peers, or the index belongs to a
@@ -175,10 +186,12 @@ class Registry:
             self._by_identity[identity] = same
             return same, None
         # A process that takes an index over needs no extra room: the older process leaves.
-        takes_over = (hello.role, hello.index) in self._by_key
+        takes_over, older = (hello.role, hello.index) in self._by_key, None
         if len(self._by_key) >= self._room.peers and not takes_over:
-            reason = f"{self._room.peers} processes take part, the most {self._room.bound}"
-            raise RefusedError("refused_full", Refused(reason, later=True))
+            older = self._of_the_largest(owner)
+            if older is None:
+                reason = f"{self._room.peers} processes take part, the most {self._room.bound}"
+                raise RefusedError("refused_full", Refused(reason, later=True))
         stranger = self._by_identity.get(identity)
         if stranger is not None:
             self.leave(stranger)
@@ -188,8 +201,11 @@ class Registry:
         if key in self._ledgers and not self._ledgers[key].is_of(owner) and owner not in ROLES:
             reason = f"{hello.role} {index} {ANOTHER_KEY}"
             raise RefusedError("refused_keys", Refused(reason))
+        if key not in self._ledgers and self._has_most_indices(owner):
+            reason = f"the key '{owner}' has {MAX_INDICES} indices, the most: leave index out"
+            raise RefusedError("refused_full", Refused(reason))
         ledger = self._open_ledger(key, hello, owner)
-        older = self._by_key.get(key)
+        older = self._by_key.get(key, older)
         if older is not None:
             self.leave(older)
         peer = Peer(hello.role, index, ledger.incarnation, hello.process, identity, now, ledger)
@@ -204,10 +220,14 @@ class Registry:
         if peer.ledger.unused and self._ledgers.get(peer.key) is peer.ledger:
             del self._ledgers[peer.key]
 
-    def forget(self, owner: str) -> None:
-        """Free all indices of a key that was revoked: nobody can come back with it."""
-        for key in [key for key, one in self._ledgers.items() if one.owner == owner]:
-            del self._ledgers[key]
+    def free_all_but(self, names: Collection[str]) -> None:
+        """Free the indices of all keys but these, as nobody can come back with a revoked key.
+
+        The incarnations go on, because the journal may have batches of the former ones.
+        """
+        for ledger in self._ledgers.values():
+            if ledger.owner not in names:
+                ledger.owner = ""
 
     def drop_silent(self, now: float, silence_s: float) -> list[Peer]:
         """Remove and return the peers that sent no message for `silence_s` seconds."""
@@ -283,12 +303,30 @@ class Registry:
         )
         raise RefusedError("refused_settings", Refused(reason))
 
+    def _of_the_largest(self, owner: str) -> Peer | None:
+        """The newest peer of the key with the most peers, if this is fair to a peer of `owner`.
+
+        The run's own keys always get a place, and never lose one.
+        """
+        of = Counter(one.holder for one in self._by_key.values() if one.holder not in OWN)
+        for largest, most in of.most_common(1):
+            if owner in OWN or of[owner] + 1 < most:
+                return next(p for p in reversed(self._by_key.values()) if p.holder == largest)
+        return None
+
+    def _has_most_indices(self, owner: str) -> bool:
+        if owner in OWN:
+            return False
+        return sum(one.owner == owner for one in self._ledgers.values()) >= MAX_INDICES
+
     def _free_index(self, role: str, now: float, owner: str) -> int:
         reserved = self._ledgers if now < self._reserved_until else {}
+        spent = self._has_most_indices(owner)
         for index in range(MAX_INDEX + 1):
             key = (role, index)
-            own = key not in self._ledgers or self._ledgers[key].is_of(owner)
-            if own and key not in self._by_key and key not in reserved:
+            ledger = self._ledgers.get(key)
+            fits = not spent if ledger is None else ledger.is_of(owner)
+            if fits and key not in self._by_key and key not in reserved:
                 return index
         reason = f"all {MAX_INDEX + 1} indices of role {role} are taken"
         raise RefusedError("refused_full", Refused(reason, later=True))

@@ -1,6 +1,7 @@
 """The master's two sockets: queues and closing time are bounded, and sends never wait."""
 
 import math
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +29,7 @@ BACKLOG = 1024
 # Bytes of a subscription or a step of a handshake; encryption adds less than this to a frame.
 MAX_COMMAND = 1024
 LOOK_S = 1.0  # between two checks of the files of unix sockets
+LAST_ANSWER_S = 0.5  # to send the last answer to a revoked key
 
 
 class Received(NamedTuple):
@@ -73,7 +75,7 @@ class Sockets:
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
         self._gate = Gate((self._router, self._pub), room, keys is not None, counters)
-        self._look = Every(LOOK_S)
+        self._look, self._end_router_s = Every(LOOK_S), math.inf
 
     @property
     def keys(self) -> Keys | None:
@@ -124,11 +126,18 @@ class Sockets:
         return Received(first.bytes, frames, holder, address)
 
     def revoked(self) -> list[Holder]:
-        """Holders of the keys revoked since the last call; they get no more weights."""
+        """Holders of the keys revoked since the last call; their connections are ended.
+
+        A socket cannot end one connection: all are ended, and workers with a valid key connect
+        again. Those of the ROUTER end a little later, after their last answer.
+        """
         gone = [] if self._authenticator is None else self._authenticator.revoked()
-        if gone and self._gate is not None:
-            # A PUB socket cannot end one subscriber: end all, and check the keys again.
+        if self._gate is not None and gone:
             self._gate.end_all(self.weights_endpoint)
+            self._end_router_s = time.monotonic() + LAST_ANSWER_S
+        elif self._gate is not None and time.monotonic() >= self._end_router_s:
+            self._gate.end_all(self.endpoint)
+            self._end_router_s = math.inf
         return gone
 
     def send(self, identity: bytes, frames: Sequence[bytes]) -> None:

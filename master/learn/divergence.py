@@ -11,13 +11,13 @@ import safetensors.numpy
 from master.learn.trainer import Trainer
 from master.record.counters import Counters
 from tangram_core.agent import NotFiniteError, Weights
-from tangram_core.errors import RunError
+from tangram_core.errors import FailedError
 from tangram_core.run.process import Every
 from tangram_core.store.files import write_whole
 
 # Time between two copies of the state. Longer: more updates are lost. Shorter: copying costs time.
 KEEP_S = 0.5
-MAX_BAD_UPDATES = 10  # undone in a row, then the run ends
+MAX_BAD_UPDATES = 10  # undone in a row, then the master ends
 UNDONE = "undone updates"
 
 
@@ -33,8 +33,8 @@ class DivergenceGuard:
 
         Args:
             trainer: new or restored.
-            evidence: file for the batch of the last failure, written when the guard ends the run.
-            limit: the run ends after this many failures in a row.
+            evidence: file for the batch of the last failure, written at the limit.
+            limit: the master ends after this many failures in a row.
 
         Raises:
             NotFiniteError: the present state is not finite.
@@ -51,7 +51,7 @@ class DivergenceGuard:
         return self._tally[UNDONE]
 
     def update(self, share: float) -> dict[str, float]:
-        """Make one update; returns its losses, empty if it was undone; RunError at the limit."""
+        """Make one update; returns its losses, empty if undone; FailedError at the limit."""
         try:
             losses = self.trainer.update(share)
         except NotFiniteError as error:
@@ -62,7 +62,7 @@ class DivergenceGuard:
         return losses
 
     def weights(self) -> Weights:
-        """The acting weights, always finite: if not, go back first; RunError at the limit."""
+        """The acting weights, always finite: if not, go back first; FailedError at the limit."""
         weights = self.trainer.weights()
         try:
             _check_finite(weights.tensors, weights.version)
@@ -72,7 +72,7 @@ class DivergenceGuard:
         return weights
 
     def check(self) -> None:
-        """Keep the present state if it is finite, else go back; RunError at the limit."""
+        """Keep the present state if it is finite, else go back; FailedError at the limit."""
         state = self.trainer.learner.state()
         try:
             _check_finite(state, self.trainer.updates)
@@ -86,11 +86,12 @@ class DivergenceGuard:
         self._in_a_row += 1
         if self._in_a_row >= self._limit:
             batch = {name: np.array(one) for name, one in self.trainer.learner.evidence().items()}
+            advice = self.trainer.learner.advice
             write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
-            raise RunError(
-                f"{error}; {self._in_a_row} times in a row, so the run ends. The last batch is in "
-                f"{self._evidence}: {self.trainer.learner.advice}, and go on from the last "
-                "checkpoint with resume=auto"
+            raise FailedError(
+                f"{error}; {self._in_a_row} times in a row. The last batch is in {self._evidence}. "
+                f"If this comes again after a restart with resume=auto, {advice}, or begin a new "
+                "run with these networks and no old episodes: warm_start=RUN_DIR"
             )
         self.trainer.go_back(self._good)
 

@@ -22,7 +22,7 @@ from tangram_core.wire.messages import Ack, EpisodeBatch, Reject, Scores
 REMEMBERED_VERSIONS = 4096
 # Limits of one key: peers that have left but whose batches wait, and bytes of all waiting batches.
 SPARE_PEERS, MAX_BYTES = 64, 512 * 2**20
-MAX_EVALUATORS = 16  # that may score the same weights
+MAX_EVALUATORS = 16  # of one key that may score the same weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +201,15 @@ class Exams:
     """The versions of weights that this master process published, and who has scored them."""
 
     def __init__(self) -> None:
-        self._scored = OrderedDict[int, set[int]]()  # version -> indices
+        self._scored = OrderedDict[int, dict[int, str]]()  # version -> index -> key
 
     def published(self, version: int) -> None:
         """Allow each evaluator to score this version once."""
-        self._scored.setdefault(version, set())
+        self._scored.setdefault(version, {})
         while len(self._scored) > REMEMBERED_VERSIONS:
             self._scored.popitem(last=False)
 
-    def take(self, version: int, index: int) -> str:
+    def take(self, version: int, index: int, key: str) -> str:
         """Note that an evaluator scored a version; returns a reason to refuse that, or empty."""
         scored = self._scored.get(version)
         if scored is None:
@@ -218,7 +218,7 @@ class Exams:
             )
         if index in scored:
             return f"it has scored weights {version} before"
-        if len(scored) >= MAX_EVALUATORS:
+        if list(scored.values()).count(key) >= MAX_EVALUATORS:
             return f"{MAX_EVALUATORS} evaluators have scored weights {version}, which is the limit"
-        scored.add(index)
+        scored[index] = key
         return ""

@@ -100,7 +100,13 @@ class Journal:
     """
 
     def __init__(
-        self, folder: Path, run_id: str, task: str, sync_s: float, after: Place | None = None
+        self,
+        folder: Path,
+        run_id: str,
+        task: str,
+        sync_s: float,
+        after: Place | None = None,
+        exposed: bool = False,
     ) -> None:
         """Open the newest segment, if there is one; a new segment is made with the first batch.
 
@@ -110,6 +116,7 @@ class Journal:
             task: digest of the settings without the agent's.
             sync_s: seconds between two syncs, 0 to sync each batch.
             after: segment of the checkpoint, and number of the last batch; None for a new run.
+            exposed: whether a checkpoint is due at once.
 
         Raises:
             JournalError: the segment cannot be opened or written.
@@ -119,7 +126,7 @@ class Journal:
         self._good = 0  # bytes of whole records
         self._bare = True  # holds nothing but its title
         self._dirty, self._sync = False, Every(sync_s)
-        self.exposed = False
+        self.exposed = exposed
         known = after or Place()
         self.segment = max([known.segment, *segments(folder)])
         self.number = known.number

@@ -71,6 +71,7 @@ class Reader:
 
     Attributes:
         number: number of the last batch that was found or is known to be lost.
+        harmed: whether a warning was given.
     """
 
     def __init__(
@@ -91,7 +92,8 @@ class Reader:
             spec: shapes and dtypes of the arrays.
             warn: called with one line for each loss, and for a record that was cut short.
         """
-        self._folder, self._owner, self._spec, self._warn = folder, (run_id, task), spec, warn
+        self._folder, self._owner, self._spec, self._log = folder, (run_id, task), spec, warn
+        self.harmed = False
         self._named, known = after is not None, after or Place()
         self._first, self.number = known.segment, known.number
         self._trouble: _Trouble | None = None
@@ -171,6 +173,10 @@ class Reader:
             known = f"{_batches(missing, not self._trouble.whole)} lost" if missing > 0 else ""
             self._tell(self._trouble, known)
             self.number += max(0, missing)
+
+    def _warn(self, line: str) -> None:
+        self.harmed = True
+        self._log(line)
 
     def _tell(self, trouble: "_Trouble", known: str) -> None:
         unknown = "the batches in that part are lost, and their number is unknown"

@@ -6,6 +6,7 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ import yaml
 from master.config import MasterConfig
 from master.record.journal import segments
 from master.record.lease import Lease, LostError
-from tangram_core.errors import ConfigError, RunError, UnavailableError
+from tangram_core.errors import ConfigError, FailedError, RunError, UnavailableError
 from tangram_core.run.code import code_of, own_code, read_code
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.run.outcome import bound_of, read_outcome
@@ -59,6 +60,7 @@ class RunFolder:
         self.bad_batch = self.path / "bad_batch.safetensors"
         self.picture = self.path / "test_episodes.png"
         self.again: dict[Path, Callable[[], object]] = {}
+        self._connection = b""
 
     def prepare(self, resume: str) -> None:
         """Make the folder; ConfigError if that fails, or it holds a run and `resume` is none."""
@@ -148,8 +150,14 @@ class RunFolder:
         config = self.read_config()
         shared = (*section_names(config), "service")
         settings = {name: config[name] for name in shared if name in config}
-        content = {**connection, "settings": settings}
-        self._write(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
+        self._connection = json.dumps({**connection, "settings": settings}, indent=1).encode()
+        self._write(self.connection, self._connection, PRIVATE)
+
+    def remove_connection(self) -> None:
+        """Remove the connection data, unless another master has written its own by now."""
+        with suppress(OSError):  # the disk failed
+            if self.connection.read_bytes() == self._connection:
+                self.connection.unlink()
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write result.json."""
@@ -187,6 +195,7 @@ class Claim:
 
         Raises:
             FolderError: the folder is gone or holds another run, or another process uses it.
+            FailedError: a master on another machine has taken the run over.
         """
         path = self.run.path
         try:
@@ -201,7 +210,7 @@ class Claim:
             before, lease = (self._lock, self._folder), self._lease
             self._take()
         except LostError as error:
-            raise FolderError(f"run_dir {path} is lost: {error}") from None
+            raise FailedError(f"run_dir {path} is lost: {error}") from None
         except (OSError, ConfigError, UnavailableError) as error:
             why = error.strerror if isinstance(error, OSError) else "another process uses it"
             raise FolderError(f"run_dir {path} cannot be locked again ({why})") from None

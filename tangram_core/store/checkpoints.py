@@ -154,10 +154,13 @@ def load_checkpoint(path: Path, stems: Collection[str] | None = None) -> Checkpo
 
 
 def set_aside(path: Path) -> Path:
-    """Rename a corrupt checkpoint, so that it is kept but no longer found as a checkpoint."""
+    """Rename a corrupt checkpoint, so that it is kept but no longer found as a checkpoint.
+
+    Only the newest that was renamed before is kept, too: a bad disk would fill up with them.
+    """
     target = path.with_name(path.name + _SET_ASIDE)
-    if target.exists():
-        shutil.rmtree(target)
+    for older in {target, *sorted(path.parent.glob(f"*{_SET_ASIDE}"))[:-1]}:
+        shutil.rmtree(older, ignore_errors=True)
     path.rename(target)
     sync_folder(path.parent)
     return target

@@ -1,10 +1,12 @@
 """Batches and checkpoints on their way to the disk, and a disk that is full."""
 
 import errno
+import json
 import logging
 import shutil
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from master.learn.trainer import Trainer
 from master.record.journal import JournalError, segments
 from master.record.recovery import Reader
 from master.record.rundir import LEASE, RunFolder
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError, FailedError, RunError
 from tangram_core.run.process import Every
 from tangram_core.store import checkpoints as checkpoints_module
 from tangram_core.store.checkpoints import DiskError, list_checkpoints
@@ -266,6 +268,22 @@ def test_nothing_is_acknowledged_while_the_run_folder_is_gone(stage: Stage, gone
     assert stage.told[-1] == "the journal can be written again: batches are taken in"
     assert len(stage.told) == (2 if gone == "moved" else 3)
     assert inserted(stage) == (1, [2])
+
+
+def test_a_master_whose_run_another_machine_has_taken_over_ends(stage: Stage) -> None:
+    """It acknowledges nothing, and leaves the other's address alone."""
+    run, theirs = stage.checkpointer._claim.run, b"theirs"
+    run.write_config({"task": {"kind": "place"}, "agent": {"kind": "pair"}})
+    run.write_connection({"endpoint": "ours"})
+    run.connection.write_bytes(theirs)
+    (stage.folder / LEASE).write_text(json.dumps({"host": "far", "id": "theirs"}))
+    stage.checkpointer._claim._lease._due = stage.checkpointer._look = Every(0.0)
+    for act in (partial(stage.keep, 1), stage.checkpointer.tick, stage.checkpointer.save):
+        with pytest.raises(FailedError, match="is lost: a process on far has taken it over") as end:
+            act()
+        assert end.value.status == 1  # the launcher starts it again, and it waits
+    run.remove_connection()
+    assert run.connection.read_bytes() == theirs
 
 
 def test_a_second_master_in_a_folder_that_was_made_anew_keeps_it(stage: Stage) -> None:

@@ -331,6 +331,8 @@ os.kill(os.getpid(), 9)
 """
     made = launcher(tmp_path, ending, logs("worker-0", "worker-1", "evaluator"))
     made._master.arguments = [*made._master.arguments, "resume=none"]
+    made._folder.write_config({"seed": 3})
+    made._folder.config.unlink()
     pids = []
     forget = Child.clear
 
@@ -347,6 +349,7 @@ os.kill(os.getpid(), 9)
     )
     assert len(pids[0]) == 3
     assert pids[0] == pids[1]
+    assert made._folder.config.read_text() == "seed: 3\n"  # the next life reads it
 
 
 @pytest.mark.cluster

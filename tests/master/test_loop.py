@@ -16,7 +16,7 @@ from master import loop as loop_module
 from master.record.delivery import EpisodesArrived
 from master.watch import metrics as metrics_module
 from master.watch.result import make_result
-from tangram_core.errors import RunError
+from tangram_core.errors import FailedError, RunError
 from tangram_core.run import process as process_module
 from tangram_core.run.process import Every
 from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
@@ -227,7 +227,9 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, o
     hub.on_poll, made.guard._keep = poison, Every(1000.0)
     with closing(made):
         if often:
-            with pytest.raises(RunError, match=r"not finite after \d updates .*3 times in a row"):
+            with pytest.raises(
+                FailedError, match=r"not finite after \d updates .*3 times in a row"
+            ):
                 made.run()
             sent = hub.values("publish")
             assert sent == sorted(set(sent))
@@ -295,7 +297,9 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
         made.reporter.scored(scores(MADE, 4).scores)
         made.reporter.flush(0)
         made.reporter.metrics._try(made.reporter.metrics._writer.flush)
-    with pytest.raises(RunError, match=r"^run_dir .*/run is gone: the run ended without a check"):
+    with pytest.raises(
+        FailedError, match=r"^run_dir .*/run is gone: the run ended without a check"
+    ):
         made.finish(launched=False)
     with pytest.raises(RunError, match=r"cannot write .*/test_episodes.png \(No such file or dir"):
         made.reporter.draw()

@@ -154,7 +154,8 @@ def keys_error(connect: str, endpoint: str) -> str:
         )
     return (
         f"wrong or stale connection file: the master at {endpoint} refuses the keys in {connect}, "
-        "which are of another run or revoked; use the file of a master that is running"
+        "which are of another run or revoked, or it has no connection free; use the file of a "
+        "master that is running"
     )
 
 

@@ -263,13 +263,58 @@ def test_after_a_restart_an_incarnation_belongs_to_the_process_that_used_it(
 
 
 def test_the_indices_of_a_revoked_key_are_free_again(registry: Registry) -> None:
-    """One key could have had all of them."""
-    for owner, index in (("mallory", 0), ("mallory", 1), ("alice", 2)):
+    """Their incarnations go on: the journal holds batches of both, and all were acknowledged."""
+    for owner, index in (("alice", 0), ("mallory", 1)):
         registry.recover(("player", index), 1, 1, 0.0, owner, owner)
-    registry.forget("mallory")
-    assert list(registry.state()) == ["player/2"]
+    registry.free_all_but(["alice"])
     later = 2.0 * GRACE_S
-    assert registry.admit(b"own", hello(process="own"), later, "player")[0].index == 0
+    with pytest.raises(RefusedError, match="player 0 takes part with another key"):
+        registry.admit(b"bob", hello(process="bob", index=0), later, "bob")
+    peer, _ = registry.admit(b"bob", hello(process="bob"), later, "bob")
+    assert (peer.index, peer.incarnation) == (1, 2)
+    restarted = Registry(FINGERPRINTS, GRACE_S)
+    assert restarted.recover(("player", 1), 1, 1, 0.0, "mallory", "mallory")
+    assert restarted.recover(("player", 1), 2, 1, 0.0, "bob", "bob")
+
+
+def test_no_key_takes_all_indices(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("master.hub.registry.MAX_INDICES", 2)
+
+    def of(owner: str, index: int = -1) -> Peer:
+        peer, _ = registry.admit(owner.encode(), hello(process=owner, index=index), 0.0, owner)
+        peer.ledger.take(peer.ledger.received + 1, WINDOW)  # so that the index is kept
+        return peer
+
+    for index in (7, 9):
+        registry.leave(of("mallory", index))
+    for own in ("player", ""):  # the run itself and another key have what they need
+        assert of(own, 8).index == 8
+    assert of("bob").index == 0
+    with pytest.raises(RefusedError, match="'mallory' has 2 indices, the most: leave index out"):
+        of("mallory", 1)
+    assert of("mallory").index == 7
+
+
+def test_in_a_full_room_the_key_with_the_most_processes_makes_place(registry: Registry) -> None:
+    full = Registry(FINGERPRINTS, GRACE_S, Room(RESERVE + HANDSHAKES + 4 * DESCRIPTORS))
+
+    def enter(name: str, owner: str) -> Peer | None:
+        peer, older = full.admit(name.encode(), hello(process=name), 0.0, owner)
+        peer.holder = owner
+        return older
+
+    assert [enter(name, "mallory") for name in "abcd"] == [None] * 4
+    with pytest.raises(RefusedError, match="4 processes take part"):
+        enter("e", "mallory")
+    assert [one and one.process for one in (enter("f", "bob"), enter("g", "bob"))] == ["d", "c"]
+    with pytest.raises(RefusedError, match="4 processes take part"):  # they have two each
+        enter("h", "bob")
+    for name in "ijkl":  # the run's own always get in, and are never sent away
+        assert enter(name, "player") is not None
+    assert [one.holder for one in full.peers] == ["player"] * 4
+    for owner in ("player", "bob"):
+        with pytest.raises(RefusedError, match="4 processes take part"):
+            enter("m", owner)
 
 
 @pytest.mark.parametrize("kept", ["in the journal", "in a checkpoint", "live"])

@@ -15,7 +15,7 @@ from master.learn import divergence as divergence_module
 from master.learn.divergence import DivergenceGuard
 from master.learn.trainer import Trainer
 from tangram_core.agent import NotFiniteError
-from tangram_core.errors import RunError
+from tangram_core.errors import FailedError
 from tests.agent.builders import random_episodes, setup
 from tests.master.builders import AGENT, trainer
 
@@ -105,7 +105,8 @@ def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
     assert [bool(guard.update(0.0)) for _ in range(3)] == [False, False, True]
     fail(learning, 99)
     assert [guard.update(0.0) for _ in range(2)] == [{}, {}]
-    with pytest.raises(RunError, match=r"critic_loss=nan.*3 times in a row.*lower agent\.actor_lr"):
+    told = r"critic_loss=nan.*3 times in a row.*lower agent\.actor_lr.*or .*warm_start=RUN_DIR$"
+    with pytest.raises(FailedError, match=told):
         guard.update(0.0)
     assert guard.undone == 5
     batch = safetensors.numpy.load_file(tmp_path / "bad")
@@ -122,7 +123,7 @@ def test_weights_that_went_bad_without_a_loss_are_never_given_out(
     assert all(np.isfinite(tensor).all() for tensor in weights.tensors.values())
     assert guard.undone == 1
     poison(learning.learner.acting)
-    with pytest.raises(RunError, match="the weights are not finite after 1 updates"):
+    with pytest.raises(FailedError, match="the weights are not finite after 1 updates"):
         guard.weights()
 
 

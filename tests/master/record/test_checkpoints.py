@@ -271,9 +271,11 @@ def test_a_folder_without_a_checkpoint_and_one_that_cannot_be_written_are_told(
 def test_a_corrupt_one_is_set_aside_for_good_and_no_longer_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for _ in range(2):
-        assert set_aside(save(tmp_path)).name == "00000005.corrupt"
+    for updates in (5, 5, 6, 7):
+        set_aside(save(tmp_path, updates))
     assert names(tmp_path) == []
+    kept = ["00000006.corrupt", "00000007.corrupt"]  # and no more, so that the disk is not filled
+    assert sorted(path.name for path in tmp_path.iterdir()) == kept
     path, events = save(tmp_path), watched_disk(monkeypatch)
     set_aside(path)
     assert events == ["renamed", tmp_path.stat().st_ino]

@@ -16,7 +16,7 @@ import pytest
 from master.record import lease as lease_module
 from master.record.lease import BOOT, Lease, LostError
 from master.record.rundir import LEASE, FolderError, RunFolder
-from tangram_core.errors import ConfigError, UnavailableError
+from tangram_core.errors import ConfigError, FailedError, UnavailableError
 from tangram_core.run.process import still_alive
 
 pytestmark = pytest.mark.fast
@@ -103,7 +103,7 @@ def test_who_lost_the_folder_acknowledges_nothing_more(tmp_path: Path) -> None:
         path = of_another(tmp_path)
         for content in (path.read_text(), ""):
             path.write_text(content)
-            with pytest.raises(FolderError, match="lost: a process on far has taken it over"):
+            with pytest.raises(FailedError, match="lost: a process on far has taken it over"):
                 claim.check()
     assert path.exists()  # it is none of ours
 

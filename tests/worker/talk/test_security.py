@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from master.hub.hub import Hub
 from master.hub.security import Given, Keys, Pair, make_keys, make_pair, read_keys, write_keys
@@ -25,9 +26,11 @@ from tangram_core.agent import Weights
 from tangram_core.errors import RunError, TangramError, UnavailableError
 from tangram_core.wire.messages import (
     PICTURE_WIDTH,
+    Alive,
     Greet,
     Heartbeat,
     Refused,
+    Reject,
     Scores,
     Stop,
     Welcome,
@@ -35,7 +38,7 @@ from tangram_core.wire.messages import (
 )
 from tangram_lab.benchmarks.trials.intruder import NOBODY, knock
 from tests.agent.builders import random_episodes
-from tests.agent.messages import episodes, hello, weights
+from tests.agent.messages import SPEC, episodes, hello, scores, weights
 from tests.master.hub.dealers import Stage, staged
 from tests.master.test_run import MADE, opened_run
 from tests.ports import free_ports
@@ -371,10 +374,53 @@ def test_a_key_is_for_one_role_and_for_its_own_indices(tmp_path: Path, file: Pat
     }
 
 
+def test_connections_of_a_revoked_key_end_also_those_that_say_nothing(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One key could have had them all. A worker with a valid key connects again by itself."""
+    monkeypatch.setattr("master.hub.security.LOOK_S", 0.05)
+    keys, bob = read_keys(file), give(file, "bob")
+    with staged(keys=read_keys(file)) as stage:
+        silent = raw(stage, keys, bob)
+        news = silent.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
+        with make_client(write_file(tmp_path, stage.hub, keys)) as client:
+            assert served(stage, client.join)
+            stage.until(lambda: news.poll(0))
+            assert recv_monitor_message(news)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED
+            write_keys(file, keys)
+            both(stage, client, lambda: news.poll(0))
+            assert recv_monitor_message(news)["event"] == zmq.EVENT_DISCONNECTED
+            client.send(episodes(), 0)
+            both(stage, client, stage.batches)
+            assert client.counters["reconnects"] == 0
+
+
+def test_an_evaluator_of_the_run_itself_is_believed_before_others(file: Path) -> None:
+    """Each key has its own share of the scores of one version."""
+    guest = give(file, "guest", "evaluator")
+    keys = read_keys(file)
+    with staged(keys=keys) as stage:
+        theirs, ours = raw(stage, keys, guest), raw(stage, keys, keys.evaluator)
+
+        def scored(end: Any, version: int) -> Any:
+            stage.hub.publish(weights(version))
+            end.send_multipart(replace(scores(), weights_version=version).encode(SPEC))
+            return asked(stage, end, Heartbeat({}))
+
+        assert isinstance(asked(stage, theirs, hello(role="evaluator", process="a")), Welcome)
+        assert scored(theirs, 1) == Alive(1)
+        assert isinstance(asked(stage, ours, hello(role="evaluator", process="b")), Welcome)
+        told = "evaluator 0: the run's own evaluator scores the weights"
+        assert scored(theirs, 2) == Reject(told, sequence=0, final=True)
+        assert scored(ours, 2) == Alive(2)
+        assert [one.index for one in stage.arrivals] == [0, 1]
+
+
 def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
     tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("master.hub.security.LOOK_S", 0.05)
+    monkeypatch.setattr("master.hub.sockets.LAST_ANSWER_S", float("inf"))
     bob = give(file, "bob")
     keys = read_keys(file)
     with staged(keys=keys, audit=Audit(tmp_path / "audit.jsonl")) as stage:
@@ -406,7 +452,7 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
             told = decode_from_master(end.recv_multipart(), None)
             assert told == Stop("the key bob was revoked")
             assert [peer.holder for peer in stage.hub.peers] == ["player"]
-            assert "player/7" not in stage.hub.state()  # bob's index is free again
+            assert "owner" not in stage.hub.state()["player/7"]  # bob's index is free again
             assert asked(stage, end, Heartbeat({})) == told
             while beside.poll(100):  # what was on its way
                 beside.recv()
