@@ -241,18 +241,26 @@ def idle_connections(target: Target) -> Seen:
 
 
 def uninvited(target: Target, role: str = "") -> Seen:
-    none = np.zeros((0, PICTURE_WIDTH, 3), np.uint8)
-    forged = Scores(1, {"mean_reward": 0.999}, none).encode(target.setup.spec)
     evaluator = target.hello(role="evaluator", index=0)
-    said = (evaluator, forged, Heartbeat({}).encode())
+    said = (evaluator, forged_scores(target, 1), Heartbeat({}).encode())
     roles = [role] if role else ["", "unknown"]
     answers = sum((target.ask(*said, role=one) for one in roles), Counter[str]())
+    held, seen = unforged(target)
+    return bool(role or not answers) and held, f"{answers.total()} answers, {seen}"
+
+
+def forged_scores(target: Target, version: int) -> list[bytes]:
+    none = np.zeros((0, PICTURE_WIDTH, 3), np.uint8)
+    return Scores(version, {"mean_reward": 0.999}, none).encode(target.setup.spec)
+
+
+def unforged(target: Target) -> Seen:
+    """Whether no forged scores are in the curve."""
     goes_on = target.goes_on()  # by now the master has handled the messages and written the curve
     curve = target.folder / "curve.jsonl"
     told = curve.read_text() if curve.exists() else ""
     forgeries = len(re.findall(r"\b0\.999\b", told))
-    held = (role or not answers) and not forgeries and goes_on
-    return bool(held), f"{answers.total()} answers, {forgeries} forged scores"
+    return not forgeries and goes_on, f"{forgeries} forged scores"
 
 
 def player_as_evaluator(target: Target) -> Seen:

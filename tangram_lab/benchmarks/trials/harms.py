@@ -52,10 +52,14 @@ def second_master(target: Target) -> Seen:
 
 
 def killed(target: Target) -> bool:
-    """Kill the master while batches are only in the journal; True if the training goes on."""
+    """Kill the master while batches are only in the journal; True if the training goes on.
+
+    Its settings are deleted just before.
+    """
     target.checkpoint()
     target.goes_on(20.0)
     master = target.master
+    (target.folder / "config.yaml").unlink()
     master.kill()
     return until(lambda: target.master.pid != master.pid and target.goes_on(10.0))
 

@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -14,8 +15,9 @@ import zmq
 from master.config import KeysConfig
 from master.hub.giving import change_keys
 from tangram_core.errors import TangramError
-from tangram_core.wire.messages import EpisodeBatch, Heartbeat
-from tangram_core.wire.schema import MAX_COUNT, seal
+from tangram_core.wire.messages import Alive, EpisodeBatch, Heartbeat
+from tangram_core.wire.schema import MAX_COUNT, opened, seal
+from tangram_lab.benchmarks.trials.attacks import forged_scores, unforged
 from tangram_lab.benchmarks.trials.target import (
     ENDS_S,
     KEYS_S,
@@ -182,6 +184,22 @@ def revoked(target: Target) -> Seen:
     return held, f"{answers.total()} answers"
 
 
+def second_evaluator(target: Target) -> Seen:
+    """Score each new version of the weights with the key of another user."""
+    file, answers = target.given("judge", role="evaluator"), Counter[str]()
+    with target.peer(role="evaluator", file=file) as one:
+        one.send_multipart(target.hello(role="evaluator", index=-1, process="judge"))
+        for _ in range(10):
+            one.send_multipart(Heartbeat({}).encode())
+            while one.poll(500):
+                said = opened(one.recv_multipart())
+                answers[said["kind"]] += 1
+                if said["kind"] == Alive.kind:
+                    one.send_multipart(forged_scores(target, said["version"]))
+    held, seen = unforged(target)
+    return held and answers["reject"] > 0, f"answered {dict(answers)}, {seen}"
+
+
 def escapes(target: Target) -> Seen:
     """Send terminal escape sequences in all texts of a worker; none may be written raw."""
     hello = target.hello(index=3060, process=ESCAPE)
@@ -222,6 +240,7 @@ NEIGHBOURS: list[Attack] = [
         for kind, count in FLOODS
     ),
     ("20", "escapes in texts", "2", escapes),
+    ("22", "scores with the key of a second evaluator", "10 times", second_evaluator),
     ("held", "a key that was taken back", "1", revoked),
     *(
         ("held", f"HELLO with {what}", "1", partial(said, fields=fields, answer=answer))

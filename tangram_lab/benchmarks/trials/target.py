@@ -151,11 +151,11 @@ class Target:
         """The folder of checkpoints."""
         return self.folder / "checkpoints"
 
-    def given(self, name: str) -> Path:
+    def given(self, name: str, role: str = "player") -> Path:
         """The connection file of user `name` with an own key; made if it does not exist."""
         file = self.folder.with_name(f"{name}.json")
         if not file.exists():
-            change_keys(KeysConfig(str(self.folder), add=name, out=str(file)))
+            change_keys(KeysConfig(str(self.folder), add=name, role=role, out=str(file)))
             time.sleep(KEYS_S)
         return file
 
