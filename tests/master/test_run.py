@@ -66,7 +66,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(
 ) -> None:
     kept = journal(tmp_path / "journal", MADE)
     for number in (1, 2, 2, 3):  # one was written twice
-        kept.append(arrival(MADE, number))
+        kept.append(replace(arrival(MADE, number), owner="revoked"))
     with opened_run(tmp_path) as (made, _):
         assert not made.checkpointer._journal.exposed
         assert made.clock.record.run_id == "run"
