@@ -9,7 +9,6 @@ may continue its batches or start there again.
 No key keeps the others out: in a full room, the key with the most processes makes place.
 """
 
-import logging
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -20,7 +19,6 @@ from tangram_core.errors import RunError, TangramError
 from tangram_core.wire.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_core.wire.schema import MAX_COUNT
 
-CROWDED = 0.9  # a warning is logged when this share of the room is taken
 MAX_INDICES = MAX_PEERS  # of one key of another user
 # A peer that asks again for weights and does not show that it got them waits so long, then twice.
 WEIGHTS_AGAIN_S = 10.0
@@ -29,8 +27,6 @@ STATUS_ANSWERS, STATUS_AGAIN_S = 64, 0.5
 ANOTHER_KEY = "takes part with another key: leave index out, or choose another"
 OWN = ("", *ROLES)  # names of the run's own keys, and of no key
 Key = tuple[str, int]
-
-log = logging.getLogger(__name__)
 
 
 class RefusedError(TangramError):
@@ -118,7 +114,7 @@ class Registry:
     """
 
     def __init__(self, fingerprints: Mapping[str, str], grace_s: float, room: Room = AMPLE) -> None:
-        self._room, self._crowded = room, False
+        self._room = room
         self.lost_batches = 0
         self._fingerprints = fingerprints
         self._grace_s, self._reserved_until = grace_s, 0.0
@@ -210,7 +206,6 @@ class Registry:
             self.leave(older)
         peer = Peer(hello.role, index, ledger.incarnation, hello.process, identity, now, ledger)
         self._by_identity[identity] = self._by_key[key] = peer
-        self._warn_early()
         return peer, older
 
     def leave(self, peer: Peer) -> None:
@@ -276,15 +271,6 @@ class Registry:
             ledger.consume(sequence)
         self._reserved_until = now + self._grace_s
         return True
-
-    def _warn_early(self) -> None:
-        """Log one warning before the room is full."""
-        taken, most = len(self._by_key), self._room.peers
-        if not self._crowded and taken >= CROWDED * most:
-            self._crowded = True
-            fields = {"event": "crowded", "count": taken}
-            text = "%d processes take part, of at most %d %s"
-            log.warning(text, taken, most, self._room.bound, extra=fields)
 
     def _check_settings(self, hello: Hello) -> None:
         ours, theirs = self._fingerprints, hello.fingerprints
