@@ -226,8 +226,8 @@ class Launcher:
         if status == 0 or self._stop_s is not None or not self._master.plan_restart(status):
             return False
         # A worker that starts now must not connect to the address of the dead master.
-        with suppress(OSError, RunError):  # the disk failed
-            self._folder.connection.unlink(missing_ok=True)
+        self._folder.remove_connection()
+        with suppress(RunError):  # the disk failed
             self._folder.write_again()  # the settings, if somebody deleted them
         self._reached = False
         self._master.arguments = [

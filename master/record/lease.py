@@ -29,6 +29,11 @@ class LostError(TangramError):
     """A process on another machine has taken the folder over."""
 
 
+def is_elsewhere(path: Path) -> bool:
+    """Whether a process on another machine has the lease; OSError if there is none."""
+    return _holder(path)[1] != BOOT.read_text().strip()
+
+
 class Lease:
     """The lease of one process, which must hold the lock (`flock`) of the folder, too."""
 
@@ -70,7 +75,7 @@ class Lease:
         """Delete the file if this process still has the lease."""
         watching.remove(self._keep)
         with suppress(OSError):
-            if self._holder()[2] == self._id:
+            if _holder(self._path)[2] == self._id:
                 self._path.unlink()
 
     def _keep(self) -> None:
@@ -79,7 +84,7 @@ class Lease:
 
     def _renew(self) -> None:
         try:
-            host, _, holder = self._holder()
+            host, _, holder = _holder(self._path)
         except FileNotFoundError:  # somebody deleted the file
             self._made()
             return
@@ -105,7 +110,7 @@ class Lease:
 
         No wait for a holder on this machine: the lock shows that its process has ended.
         """
-        (host, machine, _), first = self._holder(), _fresh(self._path)
+        (host, machine, _), first = _holder(self._path), _fresh(self._path)
         until_s = time.monotonic() + STALE_S
         if machine != self._machine:
             log.warning("waiting to see if a process on %s uses %s", host, self._path.parent)
@@ -127,13 +132,14 @@ class Lease:
             os.link(self._aside, self._path)
         self._aside.unlink()
 
-    def _holder(self) -> tuple[str, str, str]:
-        """Host, machine and id in the file; this machine and no id if a power cut damaged it."""
-        try:
-            found = json.loads(self._path.read_bytes())
-            return ascii(found["host"])[1:-1], str(found.get("machine")), str(found["id"])
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            return self._host, self._machine, ""
+
+def _holder(path: Path) -> tuple[str, str, str]:
+    """Host, machine and id in the file; this machine and no id if a power cut damaged it."""
+    try:
+        found = json.loads(path.read_bytes())
+        return ascii(found["host"])[1:-1], str(found.get("machine")), str(found["id"])
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return socket.gethostname(), BOOT.read_text().strip(), ""
 
 
 def _fresh(path: Path) -> os.stat_result:

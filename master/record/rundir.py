@@ -17,7 +17,7 @@ import yaml
 
 from master.config import MasterConfig
 from master.record.journal import segments
-from master.record.lease import Lease, LostError
+from master.record.lease import Lease, LostError, is_elsewhere
 from tangram_core.errors import ConfigError, FailedError, RunError, UnavailableError
 from tangram_core.run.code import code_of, own_code, read_code
 from tangram_core.run.outcome import FILE_NAME as RESULT
@@ -60,7 +60,6 @@ class RunFolder:
         self.bad_batch = self.path / "bad_batch.safetensors"
         self.picture = self.path / "test_episodes.png"
         self.again: dict[Path, Callable[[], object]] = {}
-        self._connection = b""
 
     def prepare(self, resume: str) -> None:
         """Make the folder; ConfigError if that fails, or it holds a run and `resume` is none."""
@@ -150,14 +149,16 @@ class RunFolder:
         config = self.read_config()
         shared = (*section_names(config), "service")
         settings = {name: config[name] for name in shared if name in config}
-        self._connection = json.dumps({**connection, "settings": settings}, indent=1).encode()
-        self._write(self.connection, self._connection, PRIVATE)
+        content = {**connection, "settings": settings}
+        self._write(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
 
     def remove_connection(self) -> None:
-        """Remove the connection data, unless another master has written its own by now."""
-        with suppress(OSError):  # the disk failed
-            if self.connection.read_bytes() == self._connection:
-                self.connection.unlink()
+        """Remove the connection data, unless a master on another machine has taken the run over."""
+        with suppress(OSError):  # there is no lease, or the disk failed
+            if is_elsewhere(self.path / LEASE):
+                return
+        with suppress(OSError):
+            self.connection.unlink(missing_ok=True)
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write result.json."""

@@ -272,10 +272,8 @@ def test_nothing_is_acknowledged_while_the_run_folder_is_gone(stage: Stage, gone
 
 def test_a_master_whose_run_another_machine_has_taken_over_ends(stage: Stage) -> None:
     """It acknowledges nothing, and leaves the other's address alone."""
-    run, theirs = stage.checkpointer._claim.run, b"theirs"
-    run.write_config({"task": {"kind": "place"}, "agent": {"kind": "pair"}})
-    run.write_connection({"endpoint": "ours"})
-    run.connection.write_bytes(theirs)
+    run = stage.checkpointer._claim.run
+    run.connection.write_text("theirs")
     (stage.folder / LEASE).write_text(json.dumps({"host": "far", "id": "theirs"}))
     stage.checkpointer._claim._lease._due = stage.checkpointer._look = Every(0.0)
     for act in (partial(stage.keep, 1), stage.checkpointer.tick, stage.checkpointer.save):
@@ -283,7 +281,7 @@ def test_a_master_whose_run_another_machine_has_taken_over_ends(stage: Stage) ->
             act()
         assert end.value.status == 1  # the launcher starts it again, and it waits
     run.remove_connection()
-    assert run.connection.read_bytes() == theirs
+    assert run.connection.read_text() == "theirs"
 
 
 def test_a_second_master_in_a_folder_that_was_made_anew_keeps_it(stage: Stage) -> None:

@@ -124,8 +124,8 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
         reason = turned_away(stage, path)
         assert reason == (
             f"wrong or stale connection file: the master at {stage.hub.endpoint} refuses the keys "
-            f"in {path}, which are of another run or revoked, or it has no connection free; use the "
-            "file of a master that is running"
+            f"in {path}, which are of another run or revoked, or it has no connection free; use "
+            "the file of a master that is running"
         )
         assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
         if wrong == "worker":
