@@ -105,6 +105,9 @@ class Loop:
         until_s = time.monotonic() + INSERT_S
         while len(self._arrived) and self._limiter.may_insert() and self.budget.takes_episodes():
             arrival = self._arrived.first()
+            if self.hub.discards(arrival):
+                self._arrived.serve(0.0)
+                continue
             if not self.checkpointer.keep(arrival):
                 return False
             self._insert(self._arrived.serve(arrival.episodes.transitions))

@@ -158,7 +158,8 @@ def open_run(
     after = Place((rest.place or Place()).segment, batches.number)
     sync_s = service.journal_sync_seconds
     # What is harmed is read no more: a checkpoint is due at once.
-    journal = Journal(folder.journal, run_id, digest, sync_s, after, exposed=batches.harmed)
+    told = folder.journal, run_id, digest, sync_s, after
+    journal = Journal(*told, exposed=batches.harmed, torn=batches.torn)
     opened.enter_context(closing(journal))
     if config.resume == "auto" and (found or trainer.episodes):
         log.info("goes on after %s updates", f"{trainer.updates:,}")

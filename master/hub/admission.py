@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from master.hub.gate import Room
-from master.hub.registry import ANOTHER_KEY, Peer, RefusedError, Registry
+from master.hub.registry import Peer, RefusedError, Registry, another_key
 from master.hub.security import Holder
 from master.hub.sockets import Sockets
 from master.record.audit import Audit
@@ -115,7 +115,7 @@ class Admission:
     def free_revoked(self) -> None:
         """Free the indices of keys that are not in the key file any more."""
         keys = self._sockets.keys
-        self.registry.free_all_but(() if keys is None else (*ROLES, *keys.given))
+        self.registry.free_all_but(set() if keys is None else keys.names)
 
     def revoke(self, identity: bytes, key: str) -> None:
         """Refuse a connection whose key was revoked, and remove its peer if there is one."""
@@ -140,7 +140,7 @@ class Admission:
             its = peer.process == hello.process or peer.key == (hello.role, hello.index)
             # The run's own workers (keys in ROLES) may take their index back from any other key.
             if its and peer.holder != caller.name and caller.name not in ROLES:
-                raise RefusedError("refused_keys", Refused(f"{peer.name} {ANOTHER_KEY}"))
+                raise another_key(peer.name, hello)
 
     def _tell_losses(self, peer: Peer) -> None:
         lost = self.registry.lost_batches - self._counters["lost_batches"]

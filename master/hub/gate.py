@@ -35,6 +35,9 @@ LET_IN = 250
 SENT = struct.Struct("=QQ")  # tcpi_bytes_sent and tcpi_bytes_retrans of Linux' struct tcp_info
 SENT_AT = 200  # their offset there
 EVENT = struct.Struct("=HI")
+# A monitor and a descriptor. Another socket may use the descriptor before the first one's monitor
+# tells that its connection is closed.
+Connection = tuple[object, int]
 EVENTS = (
     zmq.EVENT_ACCEPTED
     | zmq.EVENT_DISCONNECTED
@@ -104,8 +107,9 @@ class Gate:
     ) -> None:
         self._sockets, self._room, self._counters = sockets, room, counters
         self._encrypted = encrypted
-        self._open, self._moved = set[int](), 0.0
-        self._waiting = dict[int, str]()  # descriptor -> address, in the order they came
+        self._open, self._moved = set[Connection](), 0.0
+        # The address of each, in the order they came.
+        self._waiting = dict[Connection, str]()
         self._doors = {_door(s.getsockopt_string(zmq.LAST_ENDPOINT)) for s in sockets}
         self._monitors = [s.get_monitor_socket(EVENTS) for s in sockets]
         self._thread = Thread(target=self._watch, name="gate", daemon=True)
@@ -113,7 +117,7 @@ class Gate:
 
     def end_all(self, endpoint: str) -> None:
         """End all connections of a socket; workers with a valid key then connect again."""
-        for descriptor in list(self._open):
+        for _, descriptor in list(self._open):
             with suppress(OSError), _connection(descriptor) as found:
                 if _door(_named(found.getsockname())) == _door(endpoint):
                     found.shutdown(socket.SHUT_RDWR)
@@ -133,33 +137,38 @@ class Gate:
             poller.register(monitor, zmq.POLLIN)
         while left:
             for monitor, _ in poller.poll():
-                event, descriptor = EVENT.unpack(monitor.recv_multipart()[0])
-                if event == zmq.EVENT_MONITOR_STOPPED:
-                    left -= 1
-                elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:  # ZeroMQ does not say of which
-                    self._moved = time.monotonic()
-                else:
-                    self._open.discard(descriptor)
-                    self._waiting.pop(descriptor, None)
-                    if event == zmq.EVENT_ACCEPTED:
-                        self._accepted(descriptor)
+                left -= self._handle(monitor, monitor.recv_multipart()[0])
 
-    def _accepted(self, descriptor: int) -> None:
-        self._open.add(descriptor)
+    def _handle(self, monitor: object, told: bytes) -> bool:
+        """Handle one event; whether the monitor has stopped."""
+        event, descriptor = EVENT.unpack(told)
+        if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:  # ZeroMQ does not say of which
+            self._moved = time.monotonic()
+        elif event != zmq.EVENT_MONITOR_STOPPED:
+            one = monitor, descriptor
+            self._open.discard(one)
+            self._waiting.pop(one, None)
+            if event == zmq.EVENT_ACCEPTED:
+                self._accepted(one)
+        return bool(event == zmq.EVENT_MONITOR_STOPPED)
+
+    def _accepted(self, one: Connection) -> None:
+        self._open.add(one)
+        descriptor = one[1]
         # The connection may be closed already, and the number of its descriptor used again. Then
         # the next event tells that it was closed.
         with suppress(OSError), _connection(descriptor) as found:
-            self._waiting[descriptor] = _named(found.getpeername())
+            self._waiting[one] = _named(found.getpeername())
         if len(self._open) > self._room.connections:
             reason = f"{self._room.connections} are open already, the most {self._room.bound}"
-            self._end(descriptor, "refused_connections", reason)
+            self._end(one, "refused_connections", reason)
         while self._encrypted and len(self._waiting) > HANDSHAKES:
             self._make_room()
 
     def _make_room(self) -> None:
         """Remove one waiting connection from the list: authenticated by now, or ended here."""
         first, last = next(iter(self._waiting)), next(reversed(self._waiting))
-        with suppress(OSError), _connection(first) as found:
+        with suppress(OSError), _connection(first[1]) as found:
             if _let_in(found):
                 del self._waiting[first]
                 return
@@ -167,9 +176,9 @@ class Gate:
         reason = f"more than {HANDSHAKES} show no key"
         self._end(last if workers else first, "refused_handshakes", reason)
 
-    def _end(self, descriptor: int, counter: str, reason: str) -> None:
+    def _end(self, one: Connection, counter: str, reason: str) -> None:
         """End a connection, unless it is authenticated or the descriptor is another one now."""
-        address = self._waiting.pop(descriptor, None)
+        address, descriptor = self._waiting.pop(one, None), one[1]
         with suppress(OSError), _connection(descriptor) as found:
             mine = _door(_named(found.getsockname())) in self._doors
             mine &= _named(found.getpeername()) == address

@@ -167,6 +167,17 @@ class Hub:
             peer.inserted(arrival)
             self._sockets.answer(peer.identity, Ack(arrival.sequence, duplicate=False))
 
+    def discards(self, arrival: EpisodesArrived) -> bool:
+        """Whether not to insert a batch, because its key was revoked; it then counts as done."""
+        keys = self.keys
+        if keys is None or arrival.owner in keys.names:
+            return False
+        self._waiting.done(arrival)
+        ledger = self._registry.ledger((arrival.role, arrival.index), arrival.incarnation)
+        if ledger is not None:
+            ledger.release(arrival.sequence)
+        return True
+
     def publish(self, weights: Weights) -> None:
         """Broadcast weights, and keep them for later requests; WireError if out of bounds."""
         self._weights = WeightsMessage(self.epoch, weights).encode()
@@ -248,7 +259,8 @@ class Hub:
 
     def _heard(self, received: Received) -> Arrival | None:
         """Handle a message if its sender's key is still valid; returns a new arrival, or None."""
-        identity, frames, holder, self._address = received
+        identity, frames, _, self._address, public = received
+        holder = self._sockets.holder(public)  # the key may have been revoked since it was read
         if holder.revoked:
             self._admission.revoke(identity, holder.name)
             return None

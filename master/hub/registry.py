@@ -37,6 +37,16 @@ class RefusedError(TangramError):
         self.counter, self.answer = counter, answer
 
 
+def another_key(name: str, hello: Hello) -> RefusedError:
+    """The error for a process whose index belongs to another key.
+
+    One that had the index before lost it while this master was down; it joins again without it.
+    """
+    if hello.incarnation:
+        return RefusedError("superseded", Stop(f"{name} {TAKEN_OVER}"))
+    return RefusedError("refused_keys", Refused(f"{name} {ANOTHER_KEY}"))
+
+
 @dataclass(eq=False)
 class Peer:
     """A process that takes part: a player or an evaluator.
@@ -178,8 +188,12 @@ class Registry:
         if same is not None and same.role == hello.role:
             # The process repeats its HELLO: WELCOME was late, or the connection is new.
             self._by_identity.pop(same.identity, None)
+            if identity in self._by_identity:
+                self.leave(self._by_identity[identity])
             same.identity, same.last_seen = identity, now
             self._by_identity[identity] = same
+            # A number was refused for good by a master that was then killed.
+            self.lost_batches += same.ledger.skip_to(hello.first)
             return same, None
         # A process that takes an index over needs no extra room: the older process leaves.
         takes_over, older = (hello.role, hello.index) in self._by_key, None
@@ -195,9 +209,8 @@ class Registry:
         key = (hello.role, index)
         # The run's own workers (keys in ROLES) may take their index back from any other key.
         if key in self._ledgers and not self._ledgers[key].is_of(owner) and owner not in ROLES:
-            reason = f"{hello.role} {index} {ANOTHER_KEY}"
-            raise RefusedError("refused_keys", Refused(reason))
-        if key not in self._ledgers and self._has_most_indices(owner):
+            raise another_key(f"{hello.role} {index}", hello)
+        if not self._has(owner, key) and self._has_most_indices(owner):
             reason = f"the key '{owner}' has {MAX_INDICES} indices, the most: leave index out"
             raise RefusedError("refused_full", Refused(reason))
         ledger = self._open_ledger(key, hello, owner)
@@ -259,7 +272,12 @@ class Registry:
     ) -> bool:
         """Register a batch of the journal as inserted; False if it is a duplicate."""
         ledger = self._ledgers.get(key)
-        if ledger is None or incarnation > ledger.incarnation:
+        # The process in the checkpoint left without a batch, and its number was given again.
+        if (
+            ledger is None
+            or incarnation > ledger.incarnation
+            or (incarnation == ledger.incarnation and not ledger.may_be_of(process))
+        ):
             ledger = self._ledgers[key] = Ledger(incarnation, process=process, owner=owner)
         known = self._recovered.get((key, incarnation), 0)
         # A batch of an older incarnation may have waited here when the checkpoint was written. The
@@ -300,6 +318,9 @@ class Registry:
                 return next(p for p in reversed(self._by_key.values()) if p.holder == largest)
         return None
 
+    def _has(self, owner: str, key: Key) -> bool:
+        return key in self._ledgers and self._ledgers[key].owner == owner
+
     def _has_most_indices(self, owner: str) -> bool:
         if owner in OWN:
             return False
@@ -310,8 +331,8 @@ class Registry:
         spent = self._has_most_indices(owner)
         for index in range(MAX_INDEX + 1):
             key = (role, index)
-            ledger = self._ledgers.get(key)
-            fits = not spent if ledger is None else ledger.is_of(owner)
+            fits = key not in self._ledgers or self._ledgers[key].is_of(owner)
+            fits &= not spent or self._has(owner, key)
             if fits and key not in self._by_key and key not in reserved:
                 return index
         reason = f"all {MAX_INDEX + 1} indices of role {role} are taken"
@@ -327,7 +348,7 @@ class Registry:
             # For a new process, numbers start at 1; for a lost incarnation, at the worker's first.
             received = hello.first - 1 if hello.incarnation else 0
             ledger = Ledger(known + 1, received, unused=last is None or last.unused)
-        elif hello.incarnation < known or last.process not in ("", hello.process):
+        elif hello.incarnation < known or not last.may_be_of(hello.process):
             reason = (
                 f"{key[0]} {key[1]} {TAKEN_OVER} (incarnation {known}, this is {hello.incarnation})"
             )

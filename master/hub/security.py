@@ -82,6 +82,11 @@ class Keys:
         """Role -> key pair of the run's own workers."""
         return {role: getattr(self, role) for role in ROLES}
 
+    @property
+    def names(self) -> set[str]:
+        """The names of all keys of workers."""
+        return {*ROLES, *self.given}
+
     def content(self) -> dict[str, Any]:
         """The content of the key file."""
         return {name: value for name, value in asdict(self).items() if name != "path"}
@@ -232,7 +237,9 @@ class Authenticator:
     ) -> None:
         self.keys, self._counters, self._audit = keys, counters, audit
         self._holders, self._former = holders(keys), dict[str, Holder]()
-        self._stamp, self._look = self._stamped(), Every(LOOK_S)
+        # The first look reads the file again: it may have changed since it was read.
+        self._stamp: tuple[int, int] | None = None
+        self._look = Every(LOOK_S)
         self._thread = _Asked(context)
         self._thread.start()
         self._thread.configure_curve_callback(domain=DOMAIN, credentials_provider=self)

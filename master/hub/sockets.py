@@ -40,12 +40,14 @@ class Received(NamedTuple):
         frames: of the message.
         holder: holder of the connection's key, which may be revoked by now.
         address: network address of the sender; for a unix socket, `local` and the process id.
+        public: public key of the connection; empty without keys.
     """
 
     identity: bytes
     frames: Sequence[bytes]
     holder: Holder
     address: str
+    public: str = ""
 
 
 class Sockets:
@@ -117,13 +119,15 @@ class Sockets:
         except zmq.Again:
             return None
         frames = self._router.recv_multipart(zmq.NOBLOCK)
-        holder = Holder()
-        if self._authenticator is not None:
-            holder = self._authenticator.holder(_told(first, "User-Id"))
+        public = "" if self._authenticator is None else _told(first, "User-Id")
         address = _told(first, "Peer-Address")
         if address and self.endpoint.startswith(IPC):  # host:user:group:process
             address = f"local, pid {address.rpartition(':')[2]}"
-        return Received(first.bytes, frames, holder, address)
+        return Received(first.bytes, frames, self.holder(public), address, public)
+
+    def holder(self, public: str) -> Holder:
+        """The present holder of a public key."""
+        return Holder() if self._authenticator is None else self._authenticator.holder(public)
 
     def revoked(self) -> list[Holder]:
         """Holders of the keys revoked since the last call; their connections are ended.

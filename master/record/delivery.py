@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from tangram_core.spec import Episodes
-from tangram_core.wire.messages import Ack, EpisodeBatch, Reject, Scores
+from tangram_core.wire.messages import GAP, Ack, EpisodeBatch, Reject, Scores
 
 REMEMBERED_VERSIONS = 4096
 # Limits of one key: peers that have left but whose batches wait, and bytes of all waiting batches.
@@ -111,6 +111,10 @@ class Ledger:
         """Whether the ledger belongs to this key, or to no key."""
         return not self.owner or owner in ("", self.owner)
 
+    def may_be_of(self, process: str) -> bool:
+        """Whether the ledger belongs to this process, as far as is known."""
+        return "" in (process, self.process) or process == self.process
+
     @property
     def inserted(self) -> int:
         """Number of the last batch that is finished together with all before it."""
@@ -129,7 +133,7 @@ class Ledger:
         if verdict is Verdict.INSERTED:
             return Ack(sequence, duplicate=True)
         if verdict is Verdict.GAP:
-            why = f"batch {self.received + 1} must come first"
+            why = f"batch {self.received + 1} {GAP}"
         elif verdict is Verdict.EXCESS:
             why = f"{len(self.held)} batches are unacknowledged, which is the limit"
         else:
@@ -201,11 +205,11 @@ class Exams:
     """The versions of weights that this master process published, and who has scored them."""
 
     def __init__(self) -> None:
-        self._scored = OrderedDict[int, dict[int, str]]()  # version -> index -> key
+        self._scored = OrderedDict[int, set[tuple[str, int]]]()  # version -> keys and indices
 
     def published(self, version: int) -> None:
         """Allow each evaluator to score this version once."""
-        self._scored.setdefault(version, {})
+        self._scored.setdefault(version, set())
         while len(self._scored) > REMEMBERED_VERSIONS:
             self._scored.popitem(last=False)
 
@@ -216,9 +220,9 @@ class Exams:
             return (
                 f"weights {version} are not among the last {REMEMBERED_VERSIONS:,} of this master"
             )
-        if index in scored:
+        if (key, index) in scored:
             return f"it has scored weights {version} before"
-        if list(scored.values()).count(key) >= MAX_EVALUATORS:
+        if sum(one == key for one, _ in scored) >= MAX_EVALUATORS:
             return f"{MAX_EVALUATORS} evaluators have scored weights {version}, which is the limit"
-        scored[index] = key
+        scored.add((key, index))
         return ""

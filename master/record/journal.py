@@ -107,6 +107,7 @@ class Journal:
         sync_s: float,
         after: Place | None = None,
         exposed: bool = False,
+        torn: int | None = None,
     ) -> None:
         """Open the newest segment, if there is one; a new segment is made with the first batch.
 
@@ -117,6 +118,7 @@ class Journal:
             sync_s: seconds between two syncs, 0 to sync each batch.
             after: segment of the checkpoint, and number of the last batch; None for a new run.
             exposed: whether a checkpoint is due at once.
+            torn: where an unfinished record begins that is to be cut off the newest segment.
 
         Raises:
             JournalError: the segment cannot be opened or written.
@@ -130,7 +132,12 @@ class Journal:
         known = after or Place()
         self.segment = max([known.segment, *segments(folder)])
         self.number = known.number
-        if segment_path(folder, self.segment).exists():
+        if (path := segment_path(folder, self.segment)).exists():
+            if torn is not None:
+                try:
+                    os.truncate(path, torn)
+                except OSError as error:
+                    raise self._broken(error) from None
             self._begin()
 
     def append(self, arrival: EpisodesArrived) -> None:

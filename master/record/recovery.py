@@ -72,6 +72,7 @@ class Reader:
     Attributes:
         number: number of the last batch that was found or is known to be lost.
         harmed: whether a warning was given.
+        torn: where an unfinished record at the end of the newest segment begins; None if none.
     """
 
     def __init__(
@@ -94,6 +95,7 @@ class Reader:
         """
         self._folder, self._owner, self._spec, self._log = folder, (run_id, task), spec, warn
         self.harmed = False
+        self.torn: int | None = None
         self._named, known = after is not None, after or Place()
         self._first, self.number = known.segment, known.number
         self._trouble: _Trouble | None = None
@@ -119,6 +121,7 @@ class Reader:
 
     def _segment(self, path: Path) -> Iterator[EpisodesArrived]:
         for found in _scan(path):
+            self.torn = found.start if found.torn else None  # the last part decides
             where = f"{path} is damaged at byte {found.start:,}"
             if found.number - self.number > MAX_GAP:
                 self._lost(f"{where} (it says that it is batch {found.number:,})")
@@ -136,7 +139,10 @@ class Reader:
                 self._lost(f"{where} ({error})", found.number)
                 continue
             if title is not None and (title.run_id, title.task) != self._owner:
-                raise _of_another(path)
+                if found.start == 0:
+                    raise _of_another(path)
+                self._lost(f"{where} (the title of another run)", found.number)
+                continue
             before = found.number - (batch is not None)
             self._reached(before, path, found.start, another_life=title is not None)
             if batch is not None:
@@ -231,8 +237,8 @@ def _scan(path: Path) -> Iterator[_Found]:
             if head is not None and len(body) == length and zlib.crc32(body) == checksum:
                 yield _Found(start, end, number, body, torn=False)
             elif head is not None:
-                # The next master process appends, so its title may lie inside the torn record.
-                whole = end <= (end := min(end, _next_head(file, start + 1, size)))
+                # Nothing inside is read: a player chose those bytes.
+                whole, end = end <= size, min(end, size)
                 yield _Found(start, end, number if whole else 0, None, not whole)
             else:
                 end = _next_head(file, start + 1, size)

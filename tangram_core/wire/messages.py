@@ -56,6 +56,7 @@ WINDOW = 4  # most unacknowledged messages of a worker; play pauses when they ar
 MAX_WINDOW = 1024
 PICTURE_WIDTH, PICTURE_HEIGHT = 1024, 768  # pixels; the largest picture fills MAX_FRAMES
 MAX_ROWS = 4096
+GAP = "must come first"  # a worker reads it in a refusal
 TAKEN_OVER = "was taken over by a newer process"  # tangram-train reads it in a worker's log
 OPEN = "service.auth=off: open to whoever reaches the port"
 

@@ -65,9 +65,11 @@ def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
 _opened: list[Journal | Claim] = []
 
 
-def journal(folder: Path, made: Setup, sync_s: float = 1.0, number: int = 0) -> Journal:
+def journal(
+    folder: Path, made: Setup, sync_s: float = 1.0, number: int = 0, torn: int | None = None
+) -> Journal:
     """A journal of the run `run`, after so many batches."""
-    opened = Journal(folder, "run", made.task_digest(), sync_s, Place(number=number))
+    opened = Journal(folder, "run", made.task_digest(), sync_s, Place(number=number), torn=torn)
     _opened.append(opened)
     return opened
 
@@ -108,6 +110,10 @@ class FakeHub:
     endpoint, weights_endpoint = "tcp://127.0.0.1:1", "tcp://127.0.0.1:2"
     open_to_all = False
     broadcast_s = 0.0
+
+    def discards(self, arrival: EpisodesArrived) -> bool:
+        """Whether the batch's key was revoked."""
+        return arrival.owner == "revoked"
 
     def __init__(
         self, made: Setup, script: Iterable[list[Any]] = (), roles: Iterable[str] = ("player",)

@@ -95,6 +95,15 @@ def test_each_key_has_an_equal_share_of_what_is_learned_from(tmp_path: Path) -> 
     assert hub.values("acknowledge") == [1, 11, 2, 12, 3, 13, 4, 5, 6, 7, 8]
 
 
+def test_what_a_revoked_key_sent_before_is_not_learned_from(tmp_path: Path) -> None:
+    script = [replace(arrival(MADE, i, BATCH), owner="revoked" if i != 2 else "a") for i in (1, 2)]
+    made = loop(tmp_path, MADE, hub := FakeHub(MADE, [script]), lag_updates=64)
+    made.receive(0.0)
+    made.insert()
+    assert hub.values("acknowledge") == [2]
+    assert made.guard.trainer.episodes == BATCH
+
+
 def test_inserts_stop_for_the_sockets_and_go_on_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

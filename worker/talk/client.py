@@ -22,6 +22,7 @@ from tangram_core.spec import Episodes, EpisodeSpec
 from tangram_core.wire.addresses import host_of, reachable
 from tangram_core.wire.arrays import WeightShapes
 from tangram_core.wire.messages import (
+    GAP,
     WINDOW,
     Ack,
     Alive,
@@ -403,6 +404,9 @@ class Client:
         self._warn("rejected", "the master at %s refused a message: %s", reject.reason)
         if reject.final:
             self._again = self.outbox.remove(reject.sequence) or self._again
+        elif GAP in reject.reason and reject.sequence == self.outbox.first:
+            # The batch before was refused by a master that was killed: HELLO tells what is first.
+            self.joined, self._hello_at = False, now + self._timing.retry_s
         else:
             self._resend_at = min(self._resend_at, now + self._timing.retry_s)
 

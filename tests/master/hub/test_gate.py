@@ -15,6 +15,7 @@ import zmq
 from master.hub.gate import (
     AMPLE,
     DESCRIPTORS,
+    EVENT,
     HANDSHAKES,
     LET_IN,
     MAX_PEERS,
@@ -270,8 +271,8 @@ def test_a_number_that_is_anothers_connection_by_now_is_left_alone() -> None:
         gate = made.sockets._gate
         assert gate is not None
         for number in (far.fileno(), near.fileno(), server.fileno(), 10**6):
-            gate._accepted(number)
-            gate._end(number, "refused_handshakes", "")
+            gate._accepted((None, number))
+            gate._end((None, number), "refused_handshakes", "")
         near.sendall(b"still there")
         assert far.recv(100) == b"still there"
         assert not made.counters
@@ -288,6 +289,20 @@ def test_a_number_that_is_another_connection_by_now_is_left_alone() -> None:
         gate._end(number, "refused_handshakes", "")
         assert not ended(stranger)
         assert not made.counters
+
+
+@pytest.mark.cluster
+def test_an_end_that_is_told_late_is_not_that_of_another_socket_with_the_number() -> None:
+    """Subscribers of a revoked key went on, as nobody knew of their connections any more."""
+    with door(make_keys()) as made:
+        made.stranger()
+        gate = made.sockets._gate
+        assert gate is not None
+        made.until(lambda: gate._waiting)
+        [(monitor, number)] = gate._waiting
+        [other] = {*gate._monitors} - {monitor}
+        gate._handle(other, EVENT.pack(zmq.EVENT_DISCONNECTED, number))
+        assert [*gate._open] == [*gate._waiting] == [(monitor, number)]
 
 
 @pytest.mark.cluster

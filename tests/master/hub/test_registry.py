@@ -8,7 +8,7 @@ import pytest
 from master.hub.gate import DESCRIPTORS, HANDSHAKES, RESERVE, Room
 from master.hub.registry import Peer, RefusedError, Registry
 from tangram_core.errors import RunError
-from tangram_core.wire.messages import Refused
+from tangram_core.wire.messages import TAKEN_OVER, Refused, Stop
 from tangram_core.wire.schema import MAX_COUNT
 from tests.agent.messages import FINGERPRINTS, hello
 
@@ -272,13 +272,17 @@ def test_no_key_takes_all_indices(registry: Registry, monkeypatch: pytest.Monkey
         peer.ledger.take(peer.ledger.received + 1, WINDOW)  # so that the index is kept
         return peer
 
-    for index in (7, 9):
-        registry.leave(of("mallory", index))
+    for index in (3, 7, 9):
+        registry.leave(of("bob" if index == 3 else "mallory", index))
+    registry.free_all_but(["mallory"])
     for own in ("player", ""):  # the run itself and another key have what they need
         assert of(own, 8).index == 8
     assert of("bob").index == 0
-    with pytest.raises(RefusedError, match="'mallory' has 2 indices, the most: leave index out"):
-        of("mallory", 1)
+    for index in (1, 3):  # nobody's, and one that is free again
+        with pytest.raises(
+            RefusedError, match="'mallory' has 2 indices, the most: leave index out"
+        ):
+            of("mallory", index)
     assert of("mallory").index == 7
 
 
@@ -304,6 +308,26 @@ def test_in_a_full_room_the_key_with_the_most_processes_makes_place(registry: Re
             enter("m", owner)
 
 
+def test_a_number_that_was_given_again_is_of_the_process_whose_batches_are_journalled(
+    registry: Registry,
+) -> None:
+    """The checkpoint knows the first, which left without a batch: it may claim any number."""
+    state = {"player/0": {"incarnation": 1, "sequence": 999, "process": "left", "owner": "mallory"}}
+    registry.load_state(state, 0.0)
+    found = [registry.recover(("player", 0), 1, n, 0.0, "second", "player") for n in (1, 2, 2)]
+    assert found == [True, True, False]
+    again = {"process": "second", "index": 0, "incarnation": 1, "first": 3}
+    peer, _ = registry.admit(b"b", hello(**again), 0.0, "player")
+    assert (peer.incarnation, peer.ledger.inserted) == (1, 2)
+
+
+def test_a_process_on_the_connection_of_another_sends_that_one_away(registry: Registry) -> None:
+    first, second = admitted(registry, "a"), admitted(registry, "b")
+    assert registry.admit(b"b", hello(process="a"), 0.0) == (first, None)
+    assert (registry.peers, registry.find(b"b")) == ([first], first)
+    assert second.index == 1
+
+
 @pytest.mark.parametrize("kept", ["in the journal", "in a checkpoint", "live"])
 def test_an_index_stays_with_the_key_that_had_it_first(registry: Registry, kept: str) -> None:
     """Process, index and incarnation can be read in the run's folder; they prove nothing."""
@@ -318,10 +342,16 @@ def test_an_index_stays_with_the_key_that_had_it_first(registry: Registry, kept:
         registry.leave(registry.peers[0])
     assert registry.state() == {"player/0": entry}
     stolen = {"index": 0, "incarnation": 1, "process": "hers", "first": 1000}
-    for claim in (stolen, stolen | {"incarnation": 9}, {"index": 0, "process": "mine"}):
-        with pytest.raises(RefusedError, match="player 0 .* another key: leave index out") as told:
+    refused = "player 0 takes part with another key: leave index out, or choose another"
+    gone = Stop(f"player 0 {TAKEN_OVER}")  # it may have had the index; it joins again without it
+    for claim, answer in (
+        (stolen, gone),
+        (stolen | {"incarnation": 9}, gone),
+        ({"index": 0, "process": "mine"}, Refused(refused)),
+    ):
+        with pytest.raises(RefusedError) as told:
             registry.admit(b"mallory", hello(**claim), 1.0, "mallory")
-        assert told.value.answer == Refused(str(told.value), later=False)
+        assert told.value.answer == answer
     later = 2.0 * GRACE_S
     for owner in ("mallory", "player"):  # the lowest that is free is none of hers
         peer, _ = registry.admit(owner.encode(), hello(process=owner), later, owner)

@@ -60,7 +60,7 @@ def test_a_connection_that_died_without_a_word_is_found() -> None:
             assert gate is not None
             while not gate._open and time.monotonic() < end:
                 time.sleep(0.01)
-            [descriptor] = gate._open
+            [(_, descriptor)] = gate._open
             with _connection(descriptor) as found:
                 assert {option: found.getsockopt(*option) for option in wanted} == wanted
     finally:

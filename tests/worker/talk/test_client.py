@@ -149,6 +149,16 @@ def test_a_full_window_waits_for_an_acknowledgement(stage: Stage) -> None:
         assert client.counters["resent"] == 0
 
 
+def test_a_number_that_a_killed_master_had_refused_for_good_is_passed_over(stage: Stage) -> None:
+    """It is in no journal, so the next master waits for it."""
+    with make_client(stage.hub.endpoint) as client:
+        assert served(stage, client.join)
+        client.outbox.next = 2
+        client.send(episodes(), 0)
+        both(stage, client, stage.batches)
+        assert [batch.sequence for batch in stage.batches()] == [2]
+
+
 def test_a_batch_out_of_bounds_is_not_sent(stage: Stage) -> None:
     with joined(stage) as client:
         bad = episodes()

@@ -18,7 +18,17 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from master.hub.hub import Hub
-from master.hub.security import Given, Keys, Pair, make_keys, make_pair, read_keys, write_keys
+from master.hub.security import (
+    Given,
+    Holder,
+    Keys,
+    Pair,
+    make_keys,
+    make_pair,
+    read_keys,
+    write_keys,
+)
+from master.hub.sockets import Received
 from master.loop import Loop
 from master.record.audit import Audit
 from master.record.rundir import RunFolder
@@ -39,6 +49,7 @@ from tangram_core.wire.messages import (
 from tangram_lab.benchmarks.trials.intruder import NOBODY, knock
 from tests.agent.builders import random_episodes
 from tests.agent.messages import SPEC, episodes, hello, scores, weights
+from tests.master.builders import arrival
 from tests.master.hub.dealers import Stage, staged
 from tests.master.test_run import MADE, opened_run
 from tests.ports import free_ports
@@ -387,12 +398,29 @@ def test_connections_of_a_revoked_key_end_also_those_that_say_nothing(
             assert served(stage, client.join)
             stage.until(lambda: news.poll(0))
             assert recv_monitor_message(news)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED
+            waits, read = replace(arrival(MADE, 1), owner="bob"), Holder("bob", "player")
+            assert not stage.hub.discards(waits)
             write_keys(file, keys)
             both(stage, client, lambda: news.poll(0))
             assert recv_monitor_message(news)["event"] == zmq.EVENT_DISCONNECTED
+            assert stage.hub.discards(waits)
+            before = Received(b"bob", hello(process="bob").encode(), read, "", bob.public)
+            assert stage.hub._heard(before) is None  # it was in the inbox by then
+            assert [peer.holder for peer in stage.hub.peers] == ["player"]
             client.send(episodes(), 0)
             both(stage, client, stage.batches)
             assert client.counters["reconnects"] == 0
+
+
+def test_a_key_that_is_revoked_while_the_master_starts_is_not_valid(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("master.hub.security.LOOK_S", 0.05)
+    after, _ = read_keys(file), give(file, "bob")
+    before = read_keys(file)
+    write_keys(file, after)
+    with staged(keys=before) as stage:
+        stage.until(lambda: stage.hub.keys == after)
 
 
 def test_an_evaluator_of_the_run_itself_is_believed_before_others(file: Path) -> None:
