@@ -157,9 +157,7 @@ def open_run(
     _insert_again(batches, hub, guard, budget, lockstep, watchdog)
     after = Place((rest.place or Place()).segment, batches.number)
     sync_s = service.journal_sync_seconds
-    # What is harmed is read no more: a checkpoint is due at once.
-    told = folder.journal, run_id, digest, sync_s, after
-    journal = Journal(*told, exposed=batches.harmed, torn=batches.torn)
+    journal = Journal(folder.journal, run_id, digest, sync_s, after, batches.torn)
     opened.enter_context(closing(journal))
     if config.resume == "auto" and (found or trainer.episodes):
         log.info("goes on after %s updates", f"{trainer.updates:,}")

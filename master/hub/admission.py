@@ -76,14 +76,10 @@ class Admission:
             self._audit.note("refused", **who, **where)
             self._sockets.refuse(identity, error.counter, error.answer)
             return None
-        if older is not None and older.key == peer.key:
+        if older is not None:
             reason = f"{peer.name} {TAKEN_OVER}"
             self._tell_of("superseded", older, reason)
             self._sockets.refuse(older.identity, "superseded", Stop(reason))
-        elif older is not None:
-            reason = f"{older.name} made place: '{older.holder}' has more processes than others"
-            self._tell_of("refused", older, reason)
-            self._sockets.refuse(older.identity, "refused_full", Refused(reason, later=True))
         before, peer.address, peer.holder = peer.address, address, caller.name
         if before is None:
             self._tell_of("joined", peer)

@@ -143,7 +143,6 @@ class Hub:
 
     def poll(self, timeout_s: float) -> list[Arrival]:
         """Wait up to `timeout_s` for messages and answer them; returns new batches and scores."""
-        self._sockets.listen_again()
         self._admission.drop_revoked()  # first, so that a flood of messages cannot delay it
         if len(self._inbox) or self._sockets.wait(timeout_s):
             all_read = self._read()

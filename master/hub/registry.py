@@ -5,21 +5,17 @@ the older process. A process that reconnects after a restart of the master keeps
 the master has lost that number (in a power cut), the process gets the next one. A process can keep
 only an incarnation that a master gave. An index stays with the first key that had it: no other key
 may continue its batches or start there again.
-
-No key keeps the others out: in a full room, the key with the most processes makes place.
 """
 
-from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-from master.hub.gate import AMPLE, MAX_PEERS, Room
+from master.hub.gate import AMPLE, Room
 from master.record.delivery import EpisodesArrived, Ledger
 from tangram_core.errors import RunError, TangramError
 from tangram_core.wire.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_core.wire.schema import MAX_COUNT
 
-MAX_INDICES = MAX_PEERS  # of one key of another user
 # A peer that asks again for weights and does not show that it got them waits so long, then twice.
 WEIGHTS_AGAIN_S = 10.0
 # Status answers to one key in STATUS_AGAIN_S: so many in all, and one for each connection.
@@ -168,8 +164,6 @@ class Registry:
     ) -> tuple[Peer, Peer | None]:
         """Admit a process; a new process replaces an older one with the same index.
 
-        In a full room it replaces one of the key with the most processes.
-
         Args:
             identity: of the connection.
             hello: message of the process.
@@ -177,7 +171,7 @@ class Registry:
             owner: name of the process's key.
 
         Returns:
-            The peer, and the older peer that left for it, or None.
+            The peer, and the older peer that had the index, or None.
 
         Raises:
             RefusedError: the settings differ, there are too many peers, or the index belongs to a
@@ -196,12 +190,10 @@ class Registry:
             self.lost_batches += same.ledger.skip_to(hello.first)
             return same, None
         # A process that takes an index over needs no extra room: the older process leaves.
-        takes_over, older = (hello.role, hello.index) in self._by_key, None
+        takes_over = (hello.role, hello.index) in self._by_key
         if len(self._by_key) >= self._room.peers and not takes_over:
-            older = self._of_the_largest(owner)
-            if older is None:
-                reason = f"{self._room.peers} processes take part, the most {self._room.bound}"
-                raise RefusedError("refused_full", Refused(reason, later=True))
+            reason = f"{self._room.peers} processes take part, the most {self._room.bound}"
+            raise RefusedError("refused_full", Refused(reason, later=True))
         stranger = self._by_identity.get(identity)
         if stranger is not None:
             self.leave(stranger)
@@ -210,11 +202,8 @@ class Registry:
         # The run's own workers (keys in ROLES) may take their index back from any other key.
         if key in self._ledgers and not self._ledgers[key].is_of(owner) and owner not in ROLES:
             raise another_key(f"{hello.role} {index}", hello)
-        if not self._has(owner, key) and self._has_most_indices(owner):
-            reason = f"the key '{owner}' has {MAX_INDICES} indices, the most: leave index out"
-            raise RefusedError("refused_full", Refused(reason))
         ledger = self._open_ledger(key, hello, owner)
-        older = self._by_key.get(key, older)
+        older = self._by_key.get(key)
         if older is not None:
             self.leave(older)
         peer = Peer(hello.role, index, ledger.incarnation, hello.process, identity, now, ledger)
@@ -307,33 +296,12 @@ class Registry:
         )
         raise RefusedError("refused_settings", Refused(reason))
 
-    def _of_the_largest(self, owner: str) -> Peer | None:
-        """The newest peer of the key with the most peers, if this is fair to a peer of `owner`.
-
-        The run's own keys always get a place, and never lose one.
-        """
-        of = Counter(one.holder for one in self._by_key.values() if one.holder not in OWN)
-        for largest, most in of.most_common(1):
-            if owner in OWN or of[owner] + 1 < most:
-                return next(p for p in reversed(self._by_key.values()) if p.holder == largest)
-        return None
-
-    def _has(self, owner: str, key: Key) -> bool:
-        return key in self._ledgers and self._ledgers[key].owner == owner
-
-    def _has_most_indices(self, owner: str) -> bool:
-        if owner in OWN:
-            return False
-        return sum(one.owner == owner for one in self._ledgers.values()) >= MAX_INDICES
-
     def _free_index(self, role: str, now: float, owner: str) -> int:
         reserved = self._ledgers if now < self._reserved_until else {}
-        spent = self._has_most_indices(owner)
         for index in range(MAX_INDEX + 1):
             key = (role, index)
-            fits = key not in self._ledgers or self._ledgers[key].is_of(owner)
-            fits &= not spent or self._has(owner, key)
-            if fits and key not in self._by_key and key not in reserved:
+            own = key not in self._ledgers or self._ledgers[key].is_of(owner)
+            if own and key not in self._by_key and key not in reserved:
                 return index
         reason = f"all {MAX_INDEX + 1} indices of role {role} are taken"
         raise RefusedError("refused_full", Refused(reason, later=True))

@@ -10,10 +10,8 @@ import json
 import logging
 import os
 import re
-import socket
 import struct
 import tempfile
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -39,7 +37,6 @@ DOMAIN = "tangram"
 MAX_SOCKET_PATH = 107  # bytes, of Linux
 NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")  # of a key
 KEY_BYTES = 32
-STALE_S = 24 * 3600.0  # age at which an unused socket file is deleted
 LOOK_S = 1.0  # between two checks of the key file
 
 log = logging.getLogger(__name__)
@@ -187,7 +184,6 @@ def listening_place(bind: str, run: Path) -> str:
             "set TMPDIR to another folder, such as /tmp"
         )
     own_folder(folder)
-    _sweep(folder)
     name = hashlib.sha256(f"{run.resolve()} {found.st_dev} {found.st_ino}".encode()).hexdigest()
     place = f"{folder}/{name[:12]}"
     if len(os.fsencode(f"{place}.episodes")) > MAX_SOCKET_PATH:
@@ -196,19 +192,6 @@ def listening_place(bind: str, run: Path) -> str:
             "TMPDIR to a shorter path, such as /tmp"
         )
     return IPC + place
-
-
-def _sweep(folder: Path) -> None:
-    """Delete old socket files of masters that were killed and not restarted."""
-    for path in folder.iterdir():
-        with suppress(OSError), socket.socket(socket.AF_UNIX) as end:
-            if time.time() - path.stat().st_mtime < STALE_S:
-                continue
-            try:
-                end.setblocking(False)
-                end.connect(os.fspath(path))
-            except ConnectionRefusedError:
-                path.unlink()
 
 
 class _Asked(ThreadAuthenticator):

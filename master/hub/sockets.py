@@ -12,9 +12,7 @@ from master.hub.gate import AMPLE, Gate, Room
 from master.hub.security import Authenticator, Holder, Keys
 from master.record.audit import Audit
 from master.record.counters import Counters
-from tangram_core.errors import ConfigError, RunError
-from tangram_core.run.process import Every
-from tangram_core.store.files import own_folder
+from tangram_core.errors import ConfigError
 from tangram_core.wire.addresses import IPC, KEEPALIVE
 from tangram_core.wire.arrays import MAX_FRAME_BYTES
 from tangram_core.wire.schema import Message
@@ -28,7 +26,6 @@ HANDSHAKE_MS = 10_000
 BACKLOG = 1024
 # Bytes of a subscription or a step of a handshake; encryption adds less than this to a frame.
 MAX_COMMAND = 1024
-LOOK_S = 1.0  # between two checks of the files of unix sockets
 LAST_ANSWER_S = 0.5  # to send the last answer to a revoked key
 
 
@@ -77,36 +74,12 @@ class Sockets:
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
         self._gate = Gate((self._router, self._pub), room, keys is not None, counters)
-        self._look, self._end_router_s = Every(LOOK_S), math.inf
+        self._end_router_s = math.inf
 
     @property
     def keys(self) -> Keys | None:
         """The keys as last read from their file; None on plain sockets."""
         return None if self._authenticator is None else self._authenticator.keys
-
-    def listen_again(self) -> None:
-        """Bind unix sockets again if a cleaner of TMPDIR deleted their files; check once a second.
-
-        Without the files no worker can join. Connections that exist are not affected.
-        """
-        if not (self.endpoint.startswith(IPC) and self._look.due()):
-            return
-        ends = {self.endpoint: self._router, self.weights_endpoint: self._pub}
-        for endpoint, end in ends.items():
-            path = Path(endpoint.removeprefix(IPC))
-            if path.exists():
-                continue
-            try:
-                own_folder(path.parent)
-                end.bind(endpoint)
-                done = "it was made again"
-            except (RunError, zmq.ZMQError) as error:
-                done = f"it cannot be made again ({error}), and until then no worker can join"
-            self._counters.note(
-                "removed_sockets",
-                f"{path} was removed: {done}; exclude {path.parent} from the clean-up of "
-                f"{path.parent.parent}, or set TMPDIR to another folder",
-            )
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` for a message; returns whether there is one."""

@@ -39,7 +39,7 @@ from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
 from tangram_core.wire.schema import MAX_COUNT, Message
 
-FORMAT = 5  # format 4 had no owners
+FORMAT = 5
 SUFFIX = ".log"
 DIGITS = 8
 MAGIC = b"\xf1TJ\n"
@@ -106,7 +106,6 @@ class Journal:
         task: str,
         sync_s: float,
         after: Place | None = None,
-        exposed: bool = False,
         torn: int | None = None,
     ) -> None:
         """Open the newest segment, if there is one; a new segment is made with the first batch.
@@ -117,7 +116,6 @@ class Journal:
             task: digest of the settings without the agent's.
             sync_s: seconds between two syncs, 0 to sync each batch.
             after: segment of the checkpoint, and number of the last batch; None for a new run.
-            exposed: whether a checkpoint is due at once.
             torn: where an unfinished record begins that is to be cut off the newest segment.
 
         Raises:
@@ -128,7 +126,7 @@ class Journal:
         self._good = 0  # bytes of whole records
         self._bare = True  # holds nothing but its title
         self._dirty, self._sync = False, Every(sync_s)
-        self.exposed = exposed
+        self.exposed = False
         known = after or Place()
         self.segment = max([known.segment, *segments(folder)])
         self.number = known.number

@@ -71,7 +71,6 @@ class Reader:
 
     Attributes:
         number: number of the last batch that was found or is known to be lost.
-        harmed: whether a warning was given.
         torn: where an unfinished record at the end of the newest segment begins; None if none.
     """
 
@@ -93,8 +92,7 @@ class Reader:
             spec: shapes and dtypes of the arrays.
             warn: called with one line for each loss, and for a record that was cut short.
         """
-        self._folder, self._owner, self._spec, self._log = folder, (run_id, task), spec, warn
-        self.harmed = False
+        self._folder, self._owner, self._spec, self._warn = folder, (run_id, task), spec, warn
         self.torn: int | None = None
         self._named, known = after is not None, after or Place()
         self._first, self.number = known.segment, known.number
@@ -179,10 +177,6 @@ class Reader:
             known = f"{_batches(missing, not self._trouble.whole)} lost" if missing > 0 else ""
             self._tell(self._trouble, known)
             self.number += max(0, missing)
-
-    def _warn(self, line: str) -> None:
-        self.harmed = True
-        self._log(line)
 
     def _tell(self, trouble: "_Trouble", known: str) -> None:
         unknown = "the batches in that part are lost, and their number is unknown"
@@ -299,7 +293,7 @@ def _title(path: Path, found: _Found) -> Title | None:
         ) from None
     if header["kind"] != Title.kind:
         return None
-    if header.get("format") not in (FORMAT - 1, FORMAT):
+    if header.get("format") != FORMAT:
         raise RunError(f"{path} is not a segment of format {FORMAT}: {ANOTHER}")
     return read(Title, header)
 
@@ -307,7 +301,7 @@ def _title(path: Path, found: _Found) -> Title | None:
 def _batch(body: bytes, spec: EpisodeSpec) -> EpisodesArrived:
     """The batch in an intact record, checked as on arrival; WireError if it is not a batch."""
     header, data = _parts(body)
-    entry, frames = read(Entry, {"owner": "", **header}), split_frames(data)
+    entry, frames = read(Entry, header), split_frames(data)
     batch = decode_from_worker(frames, spec)
     if not isinstance(batch, EpisodeBatch):
         raise WireError(f"a message of kind {batch.kind!r}")

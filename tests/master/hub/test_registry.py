@@ -264,50 +264,6 @@ def test_the_indices_of_a_revoked_key_are_free_again(registry: Registry) -> None
     assert restarted.recover(("player", 1), 2, 1, 0.0, "bob", "bob")
 
 
-def test_no_key_takes_all_indices(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("master.hub.registry.MAX_INDICES", 2)
-
-    def of(owner: str, index: int = -1) -> Peer:
-        peer, _ = registry.admit(owner.encode(), hello(process=owner, index=index), 0.0, owner)
-        peer.ledger.take(peer.ledger.received + 1, WINDOW)  # so that the index is kept
-        return peer
-
-    for index in (3, 7, 9):
-        registry.leave(of("bob" if index == 3 else "mallory", index))
-    registry.free_all_but(["mallory"])
-    for own in ("player", ""):  # the run itself and another key have what they need
-        assert of(own, 8).index == 8
-    assert of("bob").index == 0
-    for index in (1, 3):  # nobody's, and one that is free again
-        with pytest.raises(
-            RefusedError, match="'mallory' has 2 indices, the most: leave index out"
-        ):
-            of("mallory", index)
-    assert of("mallory").index == 7
-
-
-def test_in_a_full_room_the_key_with_the_most_processes_makes_place(registry: Registry) -> None:
-    full = Registry(FINGERPRINTS, GRACE_S, Room(RESERVE + HANDSHAKES + 4 * DESCRIPTORS))
-
-    def enter(name: str, owner: str) -> Peer | None:
-        peer, older = full.admit(name.encode(), hello(process=name), 0.0, owner)
-        peer.holder = owner
-        return older
-
-    assert [enter(name, "mallory") for name in "abcd"] == [None] * 4
-    with pytest.raises(RefusedError, match="4 processes take part"):
-        enter("e", "mallory")
-    assert [one and one.process for one in (enter("f", "bob"), enter("g", "bob"))] == ["d", "c"]
-    with pytest.raises(RefusedError, match="4 processes take part"):  # they have two each
-        enter("h", "bob")
-    for name in "ijkl":  # the run's own always get in, and are never sent away
-        assert enter(name, "player") is not None
-    assert [one.holder for one in full.peers] == ["player"] * 4
-    for owner in ("player", "bob"):
-        with pytest.raises(RefusedError, match="4 processes take part"):
-            enter("m", owner)
-
-
 def test_a_number_that_was_given_again_is_of_the_process_whose_batches_are_journalled(
     registry: Registry,
 ) -> None:

@@ -3,9 +3,7 @@
 import json
 import os
 import re
-import socket
 import stat
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -95,25 +93,6 @@ def test_a_folder_of_sockets_that_others_may_change_is_refused(
     make(folder)
     with pytest.raises(RunError, match=re.escape(reason.format(uid=os.geteuid()))):
         listening_place("local", tmp_path)
-
-
-def test_sockets_of_masters_that_never_came_back_are_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with tempfile.TemporaryDirectory() as short:  # a socket's path must be
-        monkeypatch.setattr("tempfile.tempdir", short)
-        folder = Path(listening_place("local", tmp_path).removeprefix("ipc://")).parent
-        with socket.socket(socket.AF_UNIX) as live, socket.socket(socket.AF_UNIX) as dead:
-            live.bind(f"{folder}/live")
-            live.listen()
-            dead.bind(f"{folder}/dead")
-            dead.close()
-            listening_place("local", tmp_path)
-            assert {path.name for path in folder.iterdir()} == {"live", "dead"}  # it may come back
-            for path in folder.iterdir():
-                os.utime(path, (0, 0))
-            listening_place("local", tmp_path)
-            assert [path.name for path in folder.iterdir()] == ["live"]
 
 
 def test_a_folder_too_deep_for_sockets_is_refused(

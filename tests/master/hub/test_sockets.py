@@ -1,23 +1,18 @@
 """The master's sockets as a stranger sees them."""
 
-import shutil
 import socket
 import struct
 import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 
 import pytest
 
-from master.hub import sockets as sockets_module
 from master.hub.gate import _connection
 from master.hub.sockets import Sockets
 from master.record.counters import Counters
 from tangram_core.wire.addresses import DEAD_S, IPC, PROBE_S
-from tests.agent.messages import weights
-from tests.master.hub.dealers import staged
 
 pytestmark = pytest.mark.cluster
 
@@ -102,37 +97,3 @@ def test_who_is_gone_while_its_queue_is_full_ends_nobody() -> None:
                 peer.sendall(b"\0\x01x" * 1000)
         process.stdin.close()
         assert process.wait(60) == 0
-
-
-@pytest.mark.parametrize("what", ["files", "folder", "folder taken"])
-def test_who_comes_after_the_sockets_were_cleaned_away_joins(
-    monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
-    """It is told, and who was there before stays."""
-    monkeypatch.setattr(sockets_module, "LOOK_S", 0.0)
-    with tempfile.TemporaryDirectory() as short:  # a socket's path must be
-        folder = Path(short) / "t"
-        folder.mkdir(mode=0o700)
-        with staged(f"ipc://{folder}/run") as stage:
-            before = stage.dealer()
-            before.join()
-            shutil.rmtree(folder)
-            if what == "files":
-                folder.mkdir(mode=0o700)
-            elif what == "folder taken":
-                folder.touch()
-                stage.until(lambda: stage.hub.counters["removed_sockets"] >= 2)
-                folder.unlink()
-            stage.until(lambda: len(list(folder.glob("run.*"))) == 2)
-            assert stage.dealer().join(process="p2").index == 1
-            news = stage.subscriber()
-
-            def heard() -> int:
-                stage.hub.publish(weights(version=stage.hub.counters["published"] + 1))
-                return int(news.poll(10))
-
-            stage.until(heard)
-            assert before.join().index == 0
-            if what != "folder taken":
-                assert stage.hub.counters["removed_sockets"] == 2
-        assert list(folder.iterdir()) == []

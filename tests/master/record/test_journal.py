@@ -431,15 +431,6 @@ def test_one_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def test_one_from_before_keys_owned_what_they_sent_is_read(tmp_path: Path) -> None:
-    one, [title] = arrival(MADE, 1), Title(4, "run", MADE.task_digest()).encode()
-    [entry] = seal("batch", {"role": "player", "index": 0, "incarnation": 1, "process": "p"}, [])
-    data = record(title) + record(entry, join_frames(one.frames), 1)
-    (tmp_path / "00000001.log").write_bytes(data)
-    journal(tmp_path, MADE, number=1).append(arrival(MADE, 2))
-    assert [(found.process, found.owner) for found in read(tmp_path)] == [("p", ""), ("", "")]
-
-
 def test_a_segment_that_cannot_be_deleted_is_told_and_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
