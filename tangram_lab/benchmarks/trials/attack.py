@@ -15,6 +15,7 @@ from tangram_core.errors import TangramError
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import LOOK_S, free_port, numbers_of, result_of
 from tangram_lab.benchmarks.trials.attacks import BESIEGED, LIVE, OPEN_FILES
+from tangram_lab.benchmarks.trials.chaos import WORKERS
 from tangram_lab.benchmarks.trials.harms import harmed
 from tangram_lab.benchmarks.trials.neighbours import NEIGHBOURS
 from tangram_lab.benchmarks.trials.target import (
@@ -87,6 +88,8 @@ def run_attack(out: Path | None, folder: Path) -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         result = result_of(live)
         with training(folder / "shared", *OPEN, on_a_port()) as target:
+            # The run's own workers take their indices from any other key.
+            until(lambda: target.numbers()["players"] >= WORKERS)
             rows += tried(NEIGHBOURS, target)  # forged episodes here cannot spoil the score
         rows += meanwhile.result()
         wait_for_updates(result["updates"], straight, undisturbed)
