@@ -143,7 +143,7 @@ def flooding(target: Target, kind: str, connections: int) -> Iterator[None]:
 def shared(target: Target, kind: str, connections: int) -> Seen:
     """Whether alice and the run's own workers keep a third each while mallory floods.
 
-    Other trainings begin and end beside, so the rates before and after are measured: the less count.
+    Other trainings begin and end beside: the lesser of the rates before and after it counts.
     """
     with Steady(target) as alice:
 
