@@ -220,7 +220,7 @@ def _scan(path: Path) -> Iterator[_Found]:
     """All parts of a segment, in order."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
-        start, size = 0, os.fstat(file.fileno()).st_size
+        start, size, sure = 0, os.fstat(file.fileno()).st_size, True
         while start < size:
             file.seek(start)
             head = _read_head(file.read(HEAD.size))
@@ -229,13 +229,16 @@ def _scan(path: Path) -> Iterator[_Found]:
             # Read no further than the file goes: a forged head could ask for 4 GiB of memory.
             body = file.read(length) if end <= size else b""
             if head is not None and len(body) == length and zlib.crc32(body) == checksum:
+                sure = True
                 yield _Found(start, end, number, body, torn=False)
             elif head is not None:
-                # Nothing inside is read: a player chose those bytes.
-                whole, end = end <= size, min(end, size)
+                # Nothing inside is read, as a player chose those bytes. After damage the head may
+                # be such bytes, too: then what it claims may hold good records.
+                limit = size if sure else _next_head(file, start + 1, size)
+                whole, end = end <= limit, min(end, limit)
                 yield _Found(start, end, number if whole else 0, None, not whole)
             else:
-                end = _next_head(file, start + 1, size)
+                sure, end = False, _next_head(file, start + 1, size)
                 yield _Found(start, end, 0, None, end - start < HEAD.size)
             start = end
 

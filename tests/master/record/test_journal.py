@@ -168,14 +168,16 @@ def test_a_record_that_a_player_hid_in_a_batch_is_never_read(tmp_path: Path) -> 
     journal(tmp_path, MADE).append(arrival(MADE, 1))
     path = segments(tmp_path)[1]
     whole, hidden = path.read_bytes(), record(title)
-    for harmed in (
-        head(1000 + len(hidden), 2, 1) + hidden,
-        head(1000 + len(hidden), 2, 1) + hidden + bytes(1000) + record_at(whole, 1),
-        b"damaged" + hidden,  # by the disk, in a head
+    batch = record_at(whole, 1)
+    for harmed, found in (
+        (head(1000 + len(hidden), 2, 1) + hidden, [1]),
+        (head(1000 + len(hidden), 2, 1) + hidden + bytes(1000) + batch, [1, 1]),
+        (b"damaged by the disk, in a head" + hidden + batch, [1, 1]),
+        (b"damaged by the disk, in a head" + head(10**6, 2, 1) + batch, [1, 1]),
     ):
         path.write_bytes(whole + harmed)
         warnings: list[str] = []
-        assert sequences(tmp_path, warnings=warnings)[0] == 1
+        assert sequences(tmp_path, warnings=warnings) == found
         assert len(warnings) == 1
 
 
