@@ -23,13 +23,9 @@ PASSING = (ENOSPC, EDQUOT, EIO, EROFS, ESTALE, ENOMEM, EMFILE, ENFILE, EADDRINUS
 
 
 class TangramError(Exception):
-    """Base of every error that is shown to the user without a traceback.
+    """Base of every error that is shown to the user without a traceback."""
 
-    Attributes:
-        status: exit status of a command that ends with this error.
-    """
-
-    status = USAGE_STATUS
+    status = USAGE_STATUS  # exit status of a command that ends with this error
 
 
 class ConfigError(TangramError):

@@ -35,8 +35,7 @@ LET_IN = 250
 SENT = struct.Struct("=QQ")  # tcpi_bytes_sent and tcpi_bytes_retrans of Linux' struct tcp_info
 SENT_AT = 200  # their offset there
 EVENT = struct.Struct("=HI")
-# A monitor and a descriptor. Another socket may use the descriptor before the first one's monitor
-# tells that its connection is closed.
+# A monitor and a descriptor, which another socket may use before this monitor tells of the end.
 Connection = tuple[object, int]
 EVENTS = (
     zmq.EVENT_ACCEPTED
@@ -108,8 +107,7 @@ class Gate:
         self._sockets, self._room, self._counters = sockets, room, counters
         self._encrypted = encrypted
         self._open, self._moved = set[Connection](), 0.0
-        # The address of each, in the order they came.
-        self._waiting = dict[Connection, str]()
+        self._waiting = dict[Connection, str]()  # their addresses, in the order they came
         self._doors = {_door(s.getsockopt_string(zmq.LAST_ENDPOINT)) for s in sockets}
         self._monitors = [s.get_monitor_socket(EVENTS) for s in sockets]
         self._thread = Thread(target=self._watch, name="gate", daemon=True)

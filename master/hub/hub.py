@@ -167,14 +167,12 @@ class Hub:
             self._sockets.answer(peer.identity, Ack(arrival.sequence, duplicate=False))
 
     def discards(self, arrival: EpisodesArrived) -> bool:
-        """Whether not to insert a batch, because its key was revoked; it then counts as done."""
+        """Whether not to insert a batch, because its key was revoked."""
         keys = self.keys
         if keys is None or arrival.owner in keys.names:
             return False
         self._waiting.done(arrival)
-        ledger = self._registry.ledger((arrival.role, arrival.index), arrival.incarnation)
-        if ledger is not None:
-            ledger.release(arrival.sequence)
+        self._registry.retire((arrival.role, arrival.index), arrival.incarnation)
         return True
 
     def publish(self, weights: Weights) -> None:
@@ -345,10 +343,7 @@ class Hub:
         return None
 
     def _scores(self, peer: Peer, scores: Scores) -> ScoresArrived | None:
-        """Check scores: an evaluator may score each published version of the weights once.
-
-        One with the key of another user is heard only if the run has no evaluator of its own.
-        """
+        """Take scores, one of each version; if the run has an own evaluator, only the own one's."""
         odd = scores.scalars.keys() - self._info.scores - set(COUNTS)
         if odd:
             self._reject(peer, 0, f"scores: the task has no score named {min(odd)}")

@@ -179,7 +179,9 @@ class Registry:
         """
         self._check_settings(hello)
         same = next((p for p in self._by_key.values() if p.process == hello.process), None)
-        if same is not None and same.role == hello.role:
+        if same is not None and hello.incarnation not in (0, same.incarnation):
+            self.leave(same)  # it goes on with what it had before
+        elif same is not None and same.role == hello.role:
             # The process repeats its HELLO: WELCOME was late, or the connection is new.
             self._by_identity.pop(same.identity, None)
             if identity in self._by_identity:
@@ -218,13 +220,17 @@ class Registry:
             del self._ledgers[peer.key]
 
     def free_all_but(self, names: Collection[str]) -> None:
-        """Free the indices of all keys but these, as nobody can come back with a revoked key.
-
-        The incarnations go on, because the journal may have batches of the former ones.
-        """
+        """Free the indices of all keys but these; incarnations go on, as the journal has some."""
         for ledger in self._ledgers.values():
             if ledger.owner not in names:
                 ledger.owner = ""
+
+    def retire(self, key: Key, incarnation: int) -> None:
+        """Let nobody go on with an incarnation whose batches were dropped."""
+        if self.ledger(key, incarnation) is not None:
+            if key in self._by_key:
+                self.leave(self._by_key[key])
+            self._ledgers[key] = Ledger(incarnation + 1)
 
     def drop_silent(self, now: float, silence_s: float) -> list[Peer]:
         """Remove and return the peers that sent no message for `silence_s` seconds."""

@@ -103,10 +103,9 @@ class Sockets:
         return Holder() if self._authenticator is None else self._authenticator.holder(public)
 
     def revoked(self) -> list[Holder]:
-        """Holders of the keys revoked since the last call; their connections are ended.
+        """Holders of the keys revoked since the last call; all connections are ended.
 
-        A socket cannot end one connection: all are ended, and workers with a valid key connect
-        again. Those of the ROUTER end a little later, after their last answer.
+        Workers with a valid key connect again. The ROUTER's end later, after the last answer.
         """
         gone = [] if self._authenticator is None else self._authenticator.revoked()
         if self._gate is not None and gone:

@@ -39,7 +39,7 @@ from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
 from tangram_core.wire.schema import MAX_COUNT, Message
 
-FORMAT = 5
+FORMAT = 6
 SUFFIX = ".log"
 DIGITS = 8
 MAGIC = b"\xf1TJ\n"

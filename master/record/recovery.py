@@ -118,6 +118,7 @@ class Reader:
         self._end()
 
     def _segment(self, path: Path) -> Iterator[EpisodesArrived]:
+        self.torn = None
         for found in _scan(path):
             self.torn = found.start if found.torn else None  # the last part decides
             where = f"{path} is damaged at byte {found.start:,}"
@@ -297,6 +298,8 @@ def _title(path: Path, found: _Found) -> Title | None:
     if header["kind"] != Title.kind:
         return None
     if header.get("format") != FORMAT:
+        if found.start:
+            raise WireError("a title of another format")
         raise RunError(f"{path} is not a segment of format {FORMAT}: {ANOTHER}")
     return read(Title, header)
 

@@ -382,7 +382,8 @@ class Client:
 
     def _take_part(self, welcome: Welcome, now: float) -> None:
         sockets, address = self._connection.sockets, self._connection.address
-        if self.joined or sockets is None or address is None:
+        another = welcome.epoch != self.newest.epoch  # another master, which may give another index
+        if (self.joined and not another) or sockets is None or address is None:
             return
         wanted = address.run_id if self._welcome is None else self._welcome.run_id
         if wanted and wanted != welcome.run_id:
@@ -393,6 +394,8 @@ class Client:
         self._welcome, self.joined, self._connection.keys_refused = welcome, True, False
         self.outbox.window = min(self._window, welcome.window)
         self.newest.begin(welcome.epoch)
+        if another:  # it may have lost what was played for the last order, and give it again
+            self._order, self._again = None, not self.outbox
         sockets.subscribe(reachable(welcome.weights_endpoint, host_of(address.endpoint)))
         self._want_weights()
         self._heartbeat_at = now + self._timing.heartbeat_s

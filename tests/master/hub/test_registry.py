@@ -277,6 +277,19 @@ def test_a_number_that_was_given_again_is_of_the_process_whose_batches_are_journ
     assert (peer.incarnation, peer.ledger.inserted) == (1, 2)
 
 
+def test_a_process_that_goes_on_with_an_older_incarnation_is_not_the_newer_one(
+    registry: Registry,
+) -> None:
+    """Its first HELLO came late, when it had been dropped and had been given another."""
+    first = admitted(registry, "a", index=4)
+    first.ledger.take(1, WINDOW)
+    registry.leave(first)
+    assert admitted(registry, "a", index=4).incarnation == 2
+    with pytest.raises(RefusedError, match="player 4 was taken over by a newer process"):
+        admitted(registry, "a", index=4, incarnation=1, first=2)
+    assert registry.peers == []
+
+
 def test_a_process_on_the_connection_of_another_sends_that_one_away(registry: Registry) -> None:
     first, second = admitted(registry, "a"), admitted(registry, "b")
     assert registry.admit(b"b", hello(process="a"), 0.0) == (first, None)

@@ -429,7 +429,7 @@ def test_one_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
         journal_run_id(tmp_path)
     [later] = Title(FORMAT + 1, "run", MADE.task_digest()).encode()
     path.write_bytes(record(later))
-    with pytest.raises(RunError, match=r"is not a segment of format 5: choose another run_dir"):
+    with pytest.raises(RunError, match=r"is not a segment of format 6: choose another run_dir"):
         read(tmp_path)
 
 

@@ -398,12 +398,15 @@ def test_connections_of_a_revoked_key_end_also_those_that_say_nothing(
             assert served(stage, client.join)
             stage.until(lambda: news.poll(0))
             assert recv_monitor_message(news)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED
-            waits, read = replace(arrival(MADE, 1), owner="bob"), Holder("bob", "player")
+            waits = replace(arrival(MADE, 1), index=5, owner="bob")
             assert not stage.hub.discards(waits)
             write_keys(file, keys)
             both(stage, client, lambda: news.poll(0))
             assert recv_monitor_message(news)["event"] == zmq.EVENT_DISCONNECTED
+            stage.hub._registry.recover(("player", 5), 1, 1, 0.0, "bob", "bob")
             assert stage.hub.discards(waits)
+            assert stage.hub.state()["player/5"] == {"incarnation": 2, "sequence": 0}
+            read = Holder("bob", "player")
             before = Received(b"bob", hello(process="bob").encode(), read, "", bob.public)
             assert stage.hub._heard(before) is None  # it was in the inbox by then
             assert [peer.holder for peer in stage.hub.peers] == ["player"]
