@@ -102,7 +102,8 @@ class Admission:
 
     def drop_revoked(self) -> None:
         """Remove the peers whose keys were revoked since the last call."""
-        for holder in (gone := self._sockets.revoked()):
+        gone = self._sockets.revoked()
+        for holder in gone:
             for peer in [one for one in self.registry.peers if one.holder == holder.name]:
                 self.revoke(peer.identity, holder.name)
         if gone:

@@ -167,7 +167,7 @@ class Hub:
             self._sockets.answer(peer.identity, Ack(arrival.sequence, duplicate=False))
 
     def discards(self, arrival: EpisodesArrived) -> bool:
-        """Whether not to insert a batch, because its key was revoked."""
+        """Drop a batch if its key was revoked; returns whether that was so."""
         keys = self.keys
         if keys is None or arrival.owner in keys.names:
             return False
@@ -217,7 +217,7 @@ class Hub:
         return self._registry.recover(key, *sent, time.monotonic(), *by)
 
     def recovered(self) -> None:
-        """Call after the last `recover`: the indices of revoked keys are free."""
+        """Free the indices of revoked keys; call this after the last `recover`."""
         self._admission.free_revoked()
 
     def close(self) -> None:
@@ -343,7 +343,7 @@ class Hub:
         return None
 
     def _scores(self, peer: Peer, scores: Scores) -> ScoresArrived | None:
-        """Take scores, one of each version; if the run has an own evaluator, only the own one's."""
+        """Check scores; another user's evaluator counts only while the run has none of its own."""
         odd = scores.scalars.keys() - self._info.scores - set(COUNTS)
         if odd:
             self._reject(peer, 0, f"scores: the task has no score named {min(odd)}")

@@ -180,7 +180,7 @@ class Registry:
         self._check_settings(hello)
         same = next((p for p in self._by_key.values() if p.process == hello.process), None)
         if same is not None and hello.incarnation not in (0, same.incarnation):
-            self.leave(same)  # it goes on with what it had before
+            self.leave(same)  # this HELLO is of an earlier life: may that one go on?
         elif same is not None and same.role == hello.role:
             # The process repeats its HELLO: WELCOME was late, or the connection is new.
             self._by_identity.pop(same.identity, None)
@@ -188,7 +188,7 @@ class Registry:
                 self.leave(self._by_identity[identity])
             same.identity, same.last_seen = identity, now
             self._by_identity[identity] = same
-            # A number was refused for good by a master that was then killed.
+            # Numbers may be missing that a master refused for good before it was killed.
             self.lost_batches += same.ledger.skip_to(hello.first)
             return same, None
         # A process that takes an index over needs no extra room: the older process leaves.
@@ -220,7 +220,7 @@ class Registry:
             del self._ledgers[peer.key]
 
     def free_all_but(self, names: Collection[str]) -> None:
-        """Free the indices of all keys but these; incarnations go on, as the journal has some."""
+        """Free the indices of all keys but these; the incarnations still count up."""
         for ledger in self._ledgers.values():
             if ledger.owner not in names:
                 ledger.owner = ""

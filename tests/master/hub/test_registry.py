@@ -277,6 +277,20 @@ def test_a_number_that_was_given_again_is_of_the_process_whose_batches_are_journ
     assert (peer.incarnation, peer.ledger.inserted) == (1, 2)
 
 
+def test_nobody_goes_on_with_an_incarnation_whose_batches_were_dropped(registry: Registry) -> None:
+    for index, present in ((0, False), (1, True)):
+        peer = admitted(registry, "a", index=index)
+        peer.ledger.take(1, WINDOW)
+        if not present:
+            registry.leave(peer)
+        registry.retire(peer.key, 1)
+        registry.retire(peer.key, 1)
+        assert (registry.peers, registry.ledger(peer.key, 1)) == ([], None)
+        with pytest.raises(RefusedError, match="was taken over by a newer process"):
+            admitted(registry, "a", index=index, incarnation=1)
+    assert [one["incarnation"] for one in registry.state().values()] == [2, 2]
+
+
 def test_a_process_that_goes_on_with_an_older_incarnation_is_not_the_newer_one(
     registry: Registry,
 ) -> None:

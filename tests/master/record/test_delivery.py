@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master.record.delivery import EpisodesArrived, Ledger, Verdict, Waiting
+from master.record.delivery import (
+    MAX_EVALUATORS,
+    EpisodesArrived,
+    Exams,
+    Ledger,
+    Verdict,
+    Waiting,
+)
 from tangram_core.wire.messages import EpisodeBatch
 
 pytestmark = pytest.mark.fast
@@ -87,3 +94,13 @@ def test_a_round_in_lockstep_has_room_whatever_its_size(
     waiting, batch = Waiting(WINDOW, lockstep), cast(EpisodeBatch, None)
     waiting.add(EpisodesArrived("player", 0, 1, batch, [b"xx"]))
     assert waiting.room(("player", 0), Ledger(1, 0), 1) == room
+
+
+def test_evaluators_of_one_key_leave_those_of_others_their_scores() -> None:
+    exams = Exams()
+    exams.published(7)
+    told = [exams.take(7, index, "guest") for index in range(MAX_EVALUATORS + 1)]
+    assert told[:-1] == [""] * MAX_EVALUATORS
+    assert told[-1].endswith("which is the limit")
+    assert exams.take(7, 0, "evaluator") == ""
+    assert exams.take(7, 0, "evaluator") == "it has scored weights 7 before"

@@ -162,9 +162,18 @@ def test_a_life_that_goes_on_behind_a_torn_record_loses_nothing(tmp_path: Path) 
         assert len(warnings) == 1
 
 
+def test_what_is_cut_off_is_of_the_newest_segment(tmp_path: Path) -> None:
+    """Which is empty here: it must not become as long as the torn one."""
+    journal(tmp_path, MADE).append(arrival(MADE, 1))
+    with segments(tmp_path)[1].open("ab") as file:
+        file.write(b"torn")
+    (tmp_path / "00000002.log").touch()
+    assert read_all(tmp_path, []).torn is None
+
+
 def test_a_record_that_a_player_hid_in_a_batch_is_never_read(tmp_path: Path) -> None:
     """If a kill tears the batch, or the disk changes a bit; a title ended the run for ever."""
-    [title] = Title(FORMAT, "other", "other").encode()
+    [title], [later] = (Title(n, "other", "other").encode() for n in (FORMAT, FORMAT + 1))
     journal(tmp_path, MADE).append(arrival(MADE, 1))
     path = segments(tmp_path)[1]
     whole, hidden = path.read_bytes(), record(title)
@@ -173,6 +182,7 @@ def test_a_record_that_a_player_hid_in_a_batch_is_never_read(tmp_path: Path) -> 
         (head(1000 + len(hidden), 2, 1) + hidden, [1]),
         (head(1000 + len(hidden), 2, 1) + hidden + bytes(1000) + batch, [1, 1]),
         (b"damaged by the disk, in a head" + hidden + batch, [1, 1]),
+        (b"damaged by the disk, in a head" + record(later) + batch, [1, 1]),
         (b"damaged by the disk, in a head" + head(10**6, 2, 1) + batch, [1, 1]),
     ):
         path.write_bytes(whole + harmed)

@@ -259,6 +259,20 @@ def test_in_lockstep_what_was_refused_is_played_again(master: StandIn) -> None:
         assert client.wait_for_order(order) == order
 
 
+def test_of_another_master_the_index_counts_and_the_same_order_is_played_again(
+    master: StandIn,
+) -> None:
+    """It has lost the batch; a WELCOME of the master before may have come late."""
+    order = Go(4, 9, 12, 3)
+    with welcomed(master) as client:
+        master.say(order)
+        assert client.wait_for_order(None) == order
+        master.say(master.welcome_message(epoch="another", index=5))
+        master.until(client, lambda: client.welcome.index == 5)
+        master.say(order)
+        assert client.wait_for_order(order) == order
+
+
 def test_whoever_watches_sees_a_client_at_work(tmp_path: Path) -> None:
     seen: list[int] = []
     with make_client(tmp_path) as client:
