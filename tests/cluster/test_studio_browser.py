@@ -458,13 +458,13 @@ def test_keys_of_before_do_not_bring_an_old_figure_back(page: Page) -> None:
 
 
 def test_it_goes_on_after_a_short_loss(page: Page) -> None:
-    """Of the first move half is shown, on any clock: from some ways between it lays less."""
+    """Of the first move little is shown, on any clock: a tan left halfway may be in the way."""
     page.evaluate(
         """() => {
             const board = studio.board, closed = studio.closed.bind(studio);
             const between = board.between.bind(board);
             board.ms = Infinity;
-            board.between = (move) => between(move, 0.5);
+            board.between = (move) => between(move, 0.1);
             studio.closed = (code) => {
                 studio.before = board.frames.moves;
                 const done = closed(code);
