@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Thread
 
 import zmq
@@ -115,8 +116,9 @@ class Gate:
 
     def end_all(self, endpoint: str) -> None:
         """End all connections of a socket; workers with a valid key then connect again."""
-        for _, descriptor in list(self._open):
-            with suppress(OSError), _connection(descriptor) as found:
+        for one in Path("/proc/self/fd").iterdir():  # the thread may hear late of the newest ones
+            with suppress(OSError), _connection(int(one.name)) as found:
+                found.getpeername()  # OSError for the socket that listens
                 if _door(_named(found.getsockname())) == _door(endpoint):
                     found.shutdown(socket.SHUT_RDWR)
 
@@ -197,7 +199,12 @@ def _door(endpoint: str) -> str:
 
 def _connection(descriptor: int) -> socket.socket:
     """A second descriptor of a connection, which stays valid when the first is closed."""
-    return socket.socket(fileno=os.dup(descriptor))
+    second = os.dup(descriptor)
+    try:
+        return socket.socket(fileno=second)
+    except OSError:  # the number belongs to a file by now
+        os.close(second)
+        raise
 
 
 def _let_in(connection: socket.socket) -> bool:

@@ -22,6 +22,7 @@ from master.hub.sockets import Received, Sockets
 from master.record.audit import Audit
 from master.record.counters import Counters
 from master.record.delivery import Arrival, EpisodesArrived, Exams, ScoresArrived, Verdict, Waiting
+from master.record.journal import MARK
 from tangram_core.agent import Weights
 from tangram_core.errors import WireError
 from tangram_core.scores import COUNTS
@@ -363,6 +364,9 @@ class Hub:
     ) -> EpisodesArrived | None:
         """Accept a batch if it is the next one; else answer the worker and return None."""
         peer.damaged = 0
+        if MARK in join_frames(frames):
+            self._broken(peer, BatchError(batch.sequence, "it has the mark of our records"))
+            return None
         if self._info.lockstep and not self._is_ordered(peer, batch):
             return None
         room = self._waiting.room(peer.key, peer.ledger, len(self._registry))

@@ -179,7 +179,7 @@ class Registry:
         """
         self._check_settings(hello)
         same = next((p for p in self._by_key.values() if p.process == hello.process), None)
-        if same is not None and hello.incarnation not in (0, same.incarnation):
+        if same is not None and 0 < hello.incarnation < same.incarnation:
             self.leave(same)  # this HELLO is of an earlier life: may that one go on?
         elif same is not None and same.role == hello.role:
             # The process repeats its HELLO: WELCOME was late, or the connection is new.

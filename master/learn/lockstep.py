@@ -41,14 +41,13 @@ class Lockstep:
 
     def begins_round(self, episodes: int) -> bool:
         """Whether a round begins after `episodes` inserted episodes."""
-        return episodes % (self._players * self._size) == 0
+        return episodes // self._size % self._players == 0
 
     def orders(self, version: int, episodes: int) -> dict[int, Go]:
         """Index -> order to play with weights `version`, after `episodes` inserted episodes."""
-        number, done = divmod(episodes, self._players * self._size)
+        number, done = divmod(episodes // self._size, self._players)
         first = number * self._size
-        missing = range(done // self._size, self._players)
-        return {i: Go(number, version, first, self._size) for i in missing}
+        return {i: Go(number, version, first, self._size) for i in range(done, self._players)}
 
     def take(self, arrival: EpisodesArrived) -> None:
         """Store an ordered batch; the players' batches may arrive in any order."""
@@ -56,7 +55,7 @@ class Lockstep:
 
     def next(self, episodes: int) -> EpisodesArrived | None:
         """The batch to insert after `episodes` episodes; None until the round is complete."""
-        index = episodes % (self._players * self._size) // self._size
+        index = episodes // self._size % self._players
         if not all(i in self._arrived for i in range(index, self._players)):
             return None
         return self._arrived[index]

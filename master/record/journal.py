@@ -9,7 +9,8 @@ length of the body, the number of the record, a CRC-32 of the body and a CRC-32 
 Batches are numbered from 1 over all segments and processes of a run. A title has the number of the
 batch before it. Later formats must not change the head.
 
-The body: the length of a header (u16), the header, and for a batch its frames. Headers are declared
+The body: a mark, the length of a header (u16), the header, and for a batch its frames. No message
+may have the mark in it, so after damage it shows where the next record begins. Headers are declared
 and read like those of messages. A title names the run and the task of the batches after it; each
 segment and each master process begins with one. The header of a batch names its sender. The frames
 follow as they arrived, with their own checksum, which is checked again when they are read.
@@ -39,10 +40,11 @@ from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
 from tangram_core.wire.schema import MAX_COUNT, Message
 
-FORMAT = 6
+FORMAT = 7
 SUFFIX = ".log"
 DIGITS = 8
 MAGIC = b"\xf1TJ\n"
+MARK = b"\x9b\xf6\xd2\x8e\xc5\xb1\xe9\xa7"  # no byte of it is in a text or begins a number
 HEAD = struct.Struct("<4sIQII")
 LENGTH = struct.Struct("<H")
 CRC = struct.Struct("<I")
@@ -243,17 +245,12 @@ class Journal:
             while left:  # if the disk is nearly full, a write may be partial
                 left = left[file.write(left) or 0 :]
         except OSError as error:
-            self._take_back(file)
+            try:
+                os.ftruncate(file.fileno(), self._good)
+            except OSError:
+                self.abandon()
             raise self._broken(error) from None
         self._good += len(record)
-
-    def _take_back(self, file: FileIO) -> None:
-        """Cut off a partial record; if that fails, too, use a new segment."""
-        try:
-            os.ftruncate(file.fileno(), self._good)
-        except OSError:
-            self._drop()
-            self.segment += 1
 
     def _drop(self) -> None:
         if self._file is not None:
@@ -279,6 +276,6 @@ def segment_path(folder: Path, number: int) -> Path:
 
 def _record(header: Title | Entry, number: int, frames: Sequence[bytes]) -> bytes:
     [packed] = header.encode()
-    body = b"".join([LENGTH.pack(len(packed)), packed, join_frames(frames)])
+    body = b"".join([MARK, LENGTH.pack(len(packed)), packed, join_frames(frames)])
     head = HEAD.pack(MAGIC, len(body), number, zlib.crc32(body), 0)[: -CRC.size]
     return head + CRC.pack(zlib.crc32(head)) + body

@@ -85,13 +85,15 @@ class Lease:
     def _renew(self) -> None:
         try:
             host, _, holder = _holder(self._path)
-        except FileNotFoundError:  # somebody deleted the file
-            self._made()
-            return
+        except FileNotFoundError:
+            host = holder = ""
         if holder == self._id:
             os.utime(self._path)
-        else:
+        elif holder:
             self._lost = host
+        else:  # somebody deleted or damaged the file
+            self._path.unlink(missing_ok=True)
+            self._made()
 
     def _made(self) -> bool:
         """Make the file; False if another process has one."""

@@ -1,7 +1,7 @@
 """Reading the journal: finds the batches after a checkpoint, and reports those that are lost.
 
 After a restart, the batches are inserted again in their first order. A damaged record does not
-affect the records after it: the next one is found by its magic number. The numbers of the records
+affect the records after it: the next one is found by its mark. The numbers of the records
 show how many batches are missing. See `journal` for the format of a segment.
 """
 
@@ -19,6 +19,7 @@ from master.record.journal import (
     HEAD,
     LENGTH,
     MAGIC,
+    MARK,
     Entry,
     Place,
     Title,
@@ -32,7 +33,6 @@ from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tangram_core.wire.schema import ProtocolError, opened, read
 
 CHUNK = 2**20
-MAX_GAP = 2**32  # a record whose number is further ahead than this is taken for damaged
 ANOTHER = "choose another run_dir, or delete its folder journal to go on without it"
 
 
@@ -122,9 +122,6 @@ class Reader:
         for found in _scan(path):
             self.torn = found.start if found.torn else None  # the last part decides
             where = f"{path} is damaged at byte {found.start:,}"
-            if found.number - self.number > MAX_GAP:
-                self._lost(f"{where} (it says that it is batch {found.number:,})")
-                continue
             if found.body is None:
                 size = f"{found.end - found.start:,} bytes"
                 torn = f"{path} is cut short at byte {found.start:,} ({size}), as a kill leaves it"
@@ -138,10 +135,7 @@ class Reader:
                 self._lost(f"{where} ({error})", found.number)
                 continue
             if title is not None and (title.run_id, title.task) != self._owner:
-                if found.start == 0:
-                    raise _of_another(path)
-                self._lost(f"{where} (the title of another run)", found.number)
-                continue
+                raise _of_another(path)
             before = found.number - (batch is not None)
             self._reached(before, path, found.start, another_life=title is not None)
             if batch is not None:
@@ -221,7 +215,7 @@ def _scan(path: Path) -> Iterator[_Found]:
     """All parts of a segment, in order."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
-        start, size, sure = 0, os.fstat(file.fileno()).st_size, True
+        start, size = 0, os.fstat(file.fileno()).st_size
         while start < size:
             file.seek(start)
             head = _read_head(file.read(HEAD.size))
@@ -230,16 +224,12 @@ def _scan(path: Path) -> Iterator[_Found]:
             # Read no further than the file goes: a forged head could ask for 4 GiB of memory.
             body = file.read(length) if end <= size else b""
             if head is not None and len(body) == length and zlib.crc32(body) == checksum:
-                sure = True
                 yield _Found(start, end, number, body, torn=False)
             elif head is not None:
-                # Nothing inside is read, as a player chose those bytes. After damage the head may
-                # be such bytes, too: then what it claims may hold good records.
-                limit = size if sure else _next_head(file, start + 1, size)
-                whole, end = end <= limit, min(end, limit)
+                whole, end = end <= size, min(end, size)
                 yield _Found(start, end, number if whole else 0, None, not whole)
             else:
-                sure, end = False, _next_head(file, start + 1, size)
+                end = _next_head(file, start + 1, size)
                 yield _Found(start, end, 0, None, end - start < HEAD.size)
             start = end
 
@@ -260,12 +250,12 @@ def _next_head(file: BinaryIO, start: int, size: int) -> int:
     window = b""
     while chunk := file.read(CHUNK):
         window += chunk
-        at = window.find(MAGIC)
+        at = window.find(MARK, HEAD.size)
         while at >= 0:
-            if _read_head(window[at : at + HEAD.size]) is not None:
-                return start + at
-            at = window.find(MAGIC, at + 1)
-        passed = max(0, len(window) - HEAD.size + 1)
+            if _read_head(window[at - HEAD.size : at]) is not None:
+                return start + at - HEAD.size
+            at = window.find(MARK, at + 1)
+        passed = max(0, len(window) - HEAD.size - len(MARK) + 1)
         start, window = start + passed, window[passed:]
     return size
 
@@ -298,8 +288,6 @@ def _title(path: Path, found: _Found) -> Title | None:
     if header["kind"] != Title.kind:
         return None
     if header.get("format") != FORMAT:
-        if found.start:
-            raise WireError("a title of another format")
         raise RunError(f"{path} is not a segment of format {FORMAT}: {ANOTHER}")
     return read(Title, header)
 
@@ -317,7 +305,10 @@ def _batch(body: bytes, spec: EpisodeSpec) -> EpisodesArrived:
 
 def _parts(body: bytes) -> tuple[Mapping[str, Any], bytes]:
     """The decoded header and the joined frames of a body."""
-    if len(body) < LENGTH.size:
+    begin = len(MARK) + LENGTH.size
+    if len(body) < begin:
         raise WireError("the record is empty")
-    split = LENGTH.size + LENGTH.unpack_from(body)[0]
-    return opened([body[LENGTH.size : split]]), body[split:]
+    if not body.startswith(MARK):
+        raise ProtocolError("the record has no mark")
+    split = begin + LENGTH.unpack_from(body, len(MARK))[0]
+    return opened([body[begin:split]]), body[split:]

@@ -220,15 +220,15 @@ def formatter(log_format: str, who: str) -> logging.Formatter:
 
 
 class Every:
-    """A timer for loops: `due` is true at most once in each interval."""
+    """A timer for loops: `due` is true at most once in each interval. A suspend counts."""
 
     def __init__(self, seconds: float, at_once: bool = False) -> None:
         self._seconds = seconds
-        self._next_s = 0.0 if at_once else time.monotonic() + seconds
+        self._next_s = 0.0 if at_once else time.clock_gettime(time.CLOCK_BOOTTIME) + seconds
 
     def due(self) -> bool:
         """Whether the interval has passed; if so, the next one starts."""
-        now_s = time.monotonic()
+        now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
         if now_s < self._next_s:
             return False
         self._next_s = now_s + self._seconds
@@ -236,4 +236,4 @@ class Every:
 
     def rest(self, seconds: float) -> None:
         """Delay the next `due` to at least this many seconds from now."""
-        self._next_s = max(self._next_s, time.monotonic() + seconds)
+        self._next_s = max(self._next_s, time.clock_gettime(time.CLOCK_BOOTTIME) + seconds)

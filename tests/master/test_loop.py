@@ -126,8 +126,8 @@ def test_sockets_are_served_between_updates(
     at_polls: list[int] = []
     hub.on_poll = lambda: at_polls.append(made.guard.trainer.updates)
     made.run()
-    assert at_polls[-1] == 18
-    assert np.diff(at_polls).max() == 2
+    assert at_polls[-1] == 16
+    assert np.diff(at_polls).max() == 4
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_weights_are_sent_less_often_where_they_are_long_on_their_way(
     hub = FakeHub(MADE)
     made = loop(tmp_path, MADE, hub, {"publish_seconds": publish_seconds})
     hub.broadcast_s, clock = broadcast_s, 0.0
-    monkeypatch.setattr(process_module.time, "monotonic", lambda: clock)
+    monkeypatch.setattr(process_module.time, "clock_gettime", lambda _: clock)
     made._publish = Every(publish_seconds, at_once=True)
     for turn in range(12):
         clock, made.guard.trainer.learner.updates = turn / 4, turn

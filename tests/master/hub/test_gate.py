@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -22,6 +23,7 @@ from master.hub.gate import (
     MOST_FILES,
     RESERVE,
     Room,
+    _connection,
     _let_in,
 )
 from master.hub.security import Keys, make_keys
@@ -303,6 +305,33 @@ def test_an_end_that_is_told_late_is_not_that_of_another_socket_with_the_number(
         [other] = {*gate._monitors} - {monitor}
         gate._handle(other, EVENT.pack(zmq.EVENT_DISCONNECTED, number))
         assert [*gate._open] == [*gate._waiting] == [(monitor, number)]
+
+
+@pytest.mark.cluster
+def test_all_are_ended_of_whom_the_gate_has_not_heard_yet_and_the_socket_listens_on() -> None:
+    """A subscriber of a revoked key stayed, as its connection was told late."""
+    with door(make_keys()) as made:
+        stranger, gate = made.stranger(), made.sockets._gate
+        assert gate is not None
+        made.until(lambda: gate._open)
+        gate._open.clear()
+        gate.end_all(made.sockets.weights_endpoint)
+        assert not ended(stranger)
+        gate.end_all(made.sockets.endpoint)
+        made.until(lambda: ended(stranger))
+        made.answered(made.dealer())
+
+
+@pytest.mark.fast
+def test_a_number_that_is_a_file_by_now_leaves_no_descriptor_open(tmp_path: Path) -> None:
+    """Strangers who came and went in a flood left the master with none."""
+    descriptors = Path("/proc/self/fd")
+    with (tmp_path / "file").open("w") as file:
+        before = len([*descriptors.iterdir()])
+        for _ in range(3):
+            with pytest.raises(OSError, match="non-socket"):
+                _connection(file.fileno())
+        assert len([*descriptors.iterdir()]) == before
 
 
 @pytest.mark.cluster

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from master.record.journal import MARK
 from tangram_core.wire.messages import Ack, Alive, Bye, Go, Reject, Stop, Welcome
 from tests.agent.messages import SPEC, batch, hello, with_checksum, with_header
 from tests.master.hub.dealers import INFO, WINDOW, Dealer, Stage, staged
@@ -134,6 +135,19 @@ def test_a_wrong_batch_is_refused_for_good_and_those_after_it_are_taken(stage: S
     assert (answer.sequence, answer.final) == (9, False)
     dealer.send(3)
     stage.counted("batches", 2)
+
+
+def test_a_batch_with_the_mark_of_the_journals_records_is_refused_for_good(stage: Stage) -> None:
+    """Else what a player wrote could be read as a record where the disk is damaged."""
+    dealer = stage.dealer()
+    dealer.join(index=5)
+    frames = batch(1).encode(SPEC)
+    states = MARK + frames[1][len(MARK) :]
+    answer = dealer.ask(with_checksum([frames[0], states, *frames[2:]]))
+    assert answer == Reject("player 5: batch 1: it has the mark of our records", 1, final=True)
+    dealer.send(2)
+    stage.counted("batches")
+    assert stage.batches()[0].sequence == 2
 
 
 def flipped(number: int) -> list[bytes]:

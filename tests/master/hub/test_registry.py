@@ -98,6 +98,17 @@ def test_a_hello_again_changes_nothing_but_the_connection(registry: Registry) ->
     assert (registry.peers, registry.find(b"other")) == ([second], second)
 
 
+def test_a_hello_again_of_an_incarnation_that_the_checkpoint_had_not_changes_nothing(
+    registry: Registry,
+) -> None:
+    """It was given two numbers, kept the first one, and was told that it was taken over."""
+    admitted(registry, "a", index=0).ledger.take(1, WINDOW)
+    after = restored(registry)
+    first = admitted(after, "c", index=0, incarnation=3)
+    assert admitted(after, "c", index=0, incarnation=3) is first
+    assert admitted(after, "c", index=0, incarnation=first.incarnation) is first
+
+
 def test_the_silent_are_forgotten_but_not_their_batches(registry: Registry) -> None:
     peer = admitted(registry, "a", now=0.0)
     peer.ledger.take(1, WINDOW)

@@ -58,6 +58,21 @@ def test_a_round_that_was_cut_goes_on_with_those_who_are_missing() -> None:
     assert first.index == 1
 
 
+def test_after_rounds_of_another_size_new_ones_begin() -> None:
+    """Resumed with another service.envs: the number of episodes never was a multiple again."""
+    lockstep = Lockstep(2, SIZE)
+    assert lockstep.begins_round(18)
+    assert lockstep.orders(9, 18) == {i: Go(2, 9, 8, SIZE) for i in range(2)}
+    for index in range(2):
+        lockstep.take(batch(index))
+    for episodes in (18, 22):
+        found = lockstep.next(episodes)
+        assert found is not None
+        lockstep.inserted(found)
+    assert lockstep.begins_round(26)
+    assert lockstep.orders(9, 26) == {i: Go(3, 9, 12, SIZE) for i in range(2)}
+
+
 def test_the_settings_must_fit() -> None:
     spec = MADE.spec
     assert Lockstep.of(ServiceConfig(), 2, spec) is None

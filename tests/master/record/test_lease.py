@@ -108,11 +108,30 @@ def test_who_lost_the_folder_acknowledges_nothing_more(tmp_path: Path) -> None:
     assert path.exists()  # it is none of ours
 
 
-def test_one_that_was_tidied_up_is_made_again(tmp_path: Path) -> None:
+def test_one_that_was_tidied_up_or_damaged_is_made_again(tmp_path: Path) -> None:
+    path = tmp_path / LEASE
     with RunFolder(tmp_path).lock() as claim:
-        (tmp_path / LEASE).unlink()
+        mine = path.read_text()
+        for harm in (path.unlink, lambda: path.write_text("")):
+            harm()
+            assert claim.check() is False
+            assert path.read_text() == mine
+
+
+def test_a_machine_that_was_suspended_looks_before_it_acknowledges(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monotonic clock stands still in that time."""
+    monkeypatch.setattr(lease_module, "RENEW_S", 60.0)
+    with RunFolder(tmp_path).lock() as claim:
+        of_another(tmp_path)
         assert claim.check() is False
-        assert (tmp_path / LEASE).exists()
+        slept = time.clock_gettime(time.CLOCK_BOOTTIME) + 61.0
+        monkeypatch.setattr(
+            time, "clock_gettime", lambda clock: {time.CLOCK_BOOTTIME: slept}[clock]
+        )
+        with pytest.raises(FailedError, match="a process on far has taken it over"):
+            claim.check()
 
 
 def test_of_two_that_take_an_old_one_away_one_has_it(
