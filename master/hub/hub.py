@@ -29,6 +29,7 @@ from tangram_core.scores import COUNTS
 from tangram_core.wire.addresses import IPC
 from tangram_core.wire.arrays import MAX_FRAMES, join_frames
 from tangram_core.wire.messages import (
+    GAP,
     Ack,
     Alive,
     AskStatus,
@@ -409,10 +410,11 @@ class Hub:
 
     def _broken(self, peer: Peer, error: BatchError) -> None:
         """Refuse a batch with wrong content for good, so that the batches after it can follow."""
-        final = peer.ledger.judge(error.sequence, self._info.window) is Verdict.NEW
-        if final:
-            peer.ledger.consume(error.sequence)
-        self._reject(peer, error.sequence, f"batch {error.sequence}: {error}", final=final)
+        number, verdict = error.sequence, peer.ledger.judge(error.sequence, self._info.window)
+        if verdict is Verdict.NEW:
+            peer.ledger.consume(number)
+        why = f"batch {peer.ledger.received + 1} {GAP}" if verdict is Verdict.GAP else error
+        self._reject(peer, number, f"batch {number}: {why}", final=verdict is Verdict.NEW)
 
     def _damaged(self, identity: bytes, error: DamagedError) -> None:
         """Ask for a damaged message again; stop a peer after too many of them in a row."""
