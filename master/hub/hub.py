@@ -410,11 +410,12 @@ class Hub:
 
     def _broken(self, peer: Peer, error: BatchError) -> None:
         """Refuse a batch with wrong content for good, so that the batches after it can follow."""
-        number, verdict = error.sequence, peer.ledger.judge(error.sequence, self._info.window)
+        verdict = peer.ledger.judge(error.sequence, self._info.window)
         if verdict is Verdict.NEW:
-            peer.ledger.consume(number)
+            peer.ledger.consume(error.sequence)
         why = f"batch {peer.ledger.received + 1} {GAP}" if verdict is Verdict.GAP else error
-        self._reject(peer, number, f"batch {number}: {why}", final=verdict is Verdict.NEW)
+        final = verdict in (Verdict.NEW, Verdict.INSERTED)
+        self._reject(peer, error.sequence, f"batch {error.sequence}: {why}", final=final)
 
     def _damaged(self, identity: bytes, error: DamagedError) -> None:
         """Ask for a damaged message again; stop a peer after too many of them in a row."""

@@ -280,7 +280,7 @@ def _title(path: Path, found: _Found) -> Title | None:
     try:
         header, _ = _parts(found.body or b"")
     except ProtocolError:
-        if found.start:
+        if found.start or found.body is None:
             raise
         raise RunError(
             f"{path} was written by another version of tangram-rl: go on with that, or {ANOTHER}"
@@ -306,9 +306,7 @@ def _batch(body: bytes, spec: EpisodeSpec) -> EpisodesArrived:
 def _parts(body: bytes) -> tuple[Mapping[str, Any], bytes]:
     """The decoded header and the joined frames of a body."""
     begin = len(MARK) + LENGTH.size
-    if len(body) < begin:
-        raise WireError("the record is empty")
-    if not body.startswith(MARK):
+    if len(body) < begin or not body.startswith(MARK):
         raise ProtocolError("the record has no mark")
     split = begin + LENGTH.unpack_from(body, len(MARK))[0]
     return opened([body[begin:split]]), body[split:]

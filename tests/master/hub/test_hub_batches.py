@@ -125,10 +125,13 @@ def test_a_wrong_batch_is_refused_for_good_and_those_after_it_are_taken(stage: S
         sequence=1,
         final=True,
     )
+    again = dealer.ask(wrong)  # the answer was lost
+    assert isinstance(again, Reject)
+    assert (again.sequence, again.final) == (1, True)
     dealer.send(2)
     stage.counted("batches")
     assert stage.batches()[0].sequence == 2
-    assert stage.hub.counters["rejected"] == 1
+    assert stage.hub.counters["rejected"] == 2
     # Out of turn it may be a mutation of one that will come again. A worker whose first batch this
     # is must learn that one is missing: a killed master refused that for good.
     answer = dealer.ask(with_header(batch(9).encode(SPEC), count=0))
