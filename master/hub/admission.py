@@ -54,7 +54,7 @@ class Admission:
         counters: Counters,
         audit: Audit,
     ) -> None:
-        self.registry = Registry(info.fingerprints, silence_s, room)
+        self.registry = Registry(info.fingerprints, 0.0 if info.lockstep else silence_s, room)
         self._info, self._silence_s = info, silence_s
         self._sockets, self._counters, self._audit = sockets, counters, audit
 

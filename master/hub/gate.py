@@ -1,19 +1,17 @@
 """Limits on connections: how many in all, and how many that are not authenticated yet.
 
 ZeroMQ limits neither, and it buffers a frame of each connection before authentication. It reports
-each connection that it accepts or loses. An excess connection is shut down through a second
-descriptor of the same socket; to ZeroMQ this looks like a disconnect by the other side.
+each connection that it accepts or loses. An excess connection is shut down by the number of its
+descriptor; to ZeroMQ this looks like a disconnect by the other side.
 """
 
-import os
 import resource
 import socket
 import struct
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Thread
 
 import zmq
@@ -116,8 +114,8 @@ class Gate:
 
     def end_all(self, endpoint: str) -> None:
         """End all connections of a socket; workers with a valid key then connect again."""
-        for one in Path("/proc/self/fd").iterdir():  # the thread may hear late of the newest ones
-            with suppress(OSError), _connection(int(one.name)) as found:
+        for one in range(self._room.files):  # the thread may hear late of the newest ones
+            with suppress(OSError), _connection(one) as found:
                 found.getpeername()  # OSError for the socket that listens
                 if _door(_named(found.getsockname())) == _door(endpoint):
                     found.shutdown(socket.SHUT_RDWR)
@@ -197,14 +195,14 @@ def _door(endpoint: str) -> str:
     return endpoint.removeprefix("ipc://").rpartition(":")[2]
 
 
-def _connection(descriptor: int) -> socket.socket:
-    """A second descriptor of a connection, which stays valid when the first is closed."""
-    second = os.dup(descriptor)
+@contextmanager
+def _connection(descriptor: int) -> Iterator[socket.socket]:
+    """A connection by its number; no descriptor is taken, as strangers may have taken all."""
+    found = socket.socket(fileno=descriptor)
     try:
-        return socket.socket(fileno=second)
-    except OSError:  # the number belongs to a file by now
-        os.close(second)
-        raise
+        yield found
+    finally:
+        found.detach()
 
 
 def _let_in(connection: socket.socket) -> bool:

@@ -256,13 +256,12 @@ class Authenticator:
         """
         if not self._look.due() or (stamp := self._stamped()) in (None, self._stamp):
             return []
-        self._stamp = stamp
         try:
             keys = read_keys(self.keys.path or Path())
         except RunError as error:
-            log.warning("%s; until then the old keys stay valid", error)
+            self._counters.note("unread_keys", f"{error}; until then the old keys stay valid")
             return []
-        self.keys, found = keys, holders(keys)
+        self.keys, self._stamp, found = keys, stamp, holders(keys)
         gone = {key: one for key, one in self._holders.items() if key not in found}
         for key in found.keys() - self._holders.keys():
             log.info("the key '%s' may take part from now on", found[key].name)

@@ -49,7 +49,7 @@ class Lease:
         self._path, self._id = path, secrets.token_hex(8)
         self._host, self._machine = socket.gethostname(), BOOT.read_text().strip()
         self._aside = path.with_name(f"{path.name}.{self._id}")
-        self._due, self._lost = Every(RENEW_S), ""
+        self._due, self._lost, self._silent = Every(RENEW_S), "", Every(STALE_S)
         try:
             while not self._made():
                 with suppress(FileNotFoundError):  # another process was quicker
@@ -89,11 +89,12 @@ class Lease:
             host = holder = ""
         if holder == self._id:
             os.utime(self._path)
-        elif holder:
-            self._lost = host
+        elif holder or self._silent.due():  # after so long another may have had it, and ended
+            self._lost = host or "another machine"
         else:  # somebody deleted or damaged the file
             self._path.unlink(missing_ok=True)
             self._made()
+        self._silent = Every(STALE_S)
 
     def _made(self) -> bool:
         """Make the file; False if another process has one."""

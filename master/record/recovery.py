@@ -225,12 +225,10 @@ def _scan(path: Path) -> Iterator[_Found]:
             body = file.read(length) if end <= size else b""
             if head is not None and len(body) == length and zlib.crc32(body) == checksum:
                 yield _Found(start, end, number, body, torn=False)
-            elif head is not None:
-                whole, end = end <= size, min(end, size)
-                yield _Found(start, end, number if whole else 0, None, not whole)
             else:
-                end = _next_head(file, start + 1, size)
-                yield _Found(start, end, 0, None, end - start < HEAD.size)
+                told, end = end, min(end if head else size, _next_head(file, start + 1, size))
+                torn = end == size < told
+                yield _Found(start, end, number if told == end else 0, None, torn)
             start = end
 
 

@@ -193,6 +193,7 @@ class Client:
         if not self.outbox:
             self._be_patient(time.monotonic())
         self.outbox.add(frames)
+        self._again = False
         self._post(frames)
         self.poll()
         return True
@@ -227,7 +228,6 @@ class Client:
 
         if not self._wait(is_new, "its turn"):
             return None
-        self._again = False
         return self._order
 
     def close(self) -> None:
@@ -391,6 +391,8 @@ class Client:
                 f"the master at {address.endpoint} runs '{welcome.run_id}', not '{wanted}': the "
                 "connection file is stale, use the one of a master that is running"
             )
+        if self._welcome is not None and self._welcome.lockstep != welcome.lockstep:
+            raise TangramError("the master has another service.mode now: start this worker again")
         self._welcome, self.joined, self._connection.keys_refused = welcome, True, False
         self.outbox.window = min(self._window, welcome.window)
         self.newest.begin(welcome.epoch)

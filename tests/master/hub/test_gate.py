@@ -1,5 +1,6 @@
 """Connections beyond a bound are ended, those of others never."""
 
+import errno
 import os
 import resource
 import socket
@@ -322,16 +323,35 @@ def test_all_are_ended_of_whom_the_gate_has_not_heard_yet_and_the_socket_listens
         made.answered(made.dealer())
 
 
+@pytest.mark.cluster
+def test_connections_end_also_where_no_descriptor_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flood had taken all: the master failed, and a revoked key went on hearing."""
+
+    def no_room(*_: object) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    with door(make_keys()) as made:
+        stranger, gate = made.stranger(), made.sockets._gate
+        assert gate is not None
+        made.until(lambda: gate._open)
+        with monkeypatch.context() as patch:
+            for name in ("dup", "open", "listdir", "scandir"):
+                patch.setattr(os, name, no_room)
+            gate.end_all(made.sockets.endpoint)
+        made.until(lambda: ended(stranger))
+
+
 @pytest.mark.fast
-def test_a_number_that_is_a_file_by_now_leaves_no_descriptor_open(tmp_path: Path) -> None:
-    """Strangers who came and went in a flood left the master with none."""
+def test_a_number_that_is_a_file_by_now_leaves_all_as_it_was(tmp_path: Path) -> None:
+    """Strangers who came and went in a flood left the master without descriptors."""
     descriptors = Path("/proc/self/fd")
     with (tmp_path / "file").open("w") as file:
         before = len([*descriptors.iterdir()])
         for _ in range(3):
-            with pytest.raises(OSError, match="non-socket"):
-                _connection(file.fileno())
+            with pytest.raises(OSError, match="non-socket"), _connection(file.fileno()):
+                pass
         assert len([*descriptors.iterdir()]) == before
+        assert not os.fstat(file.fileno()).st_size
 
 
 @pytest.mark.cluster

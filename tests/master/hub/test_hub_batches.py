@@ -66,6 +66,14 @@ def test_in_lockstep_a_batch_is_what_was_ordered_or_it_is_ordered_again() -> Non
         assert len(stage.batches()) == 1
 
 
+def test_in_lockstep_a_restarted_master_gives_the_first_index_to_whoever_comes() -> None:
+    """It kept it for a worker that had ended, and ordered what nobody was there to play."""
+    with staged(info=replace(INFO, lockstep=True)) as stage:
+        known = {"player/0": {"incarnation": 1, "sequence": 4}}
+        stage.hub.load_state(known)
+        assert stage.dealer().join().index == 0
+
+
 def test_an_order_is_told_again_until_its_batch_has_come(stage: Stage) -> None:
     one, other, evaluator = stage.dealer(), stage.dealer(), stage.dealer()
     one.join(index=0)

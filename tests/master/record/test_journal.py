@@ -250,6 +250,18 @@ def test_damage_at_the_end_is_no_torn_record_in_any_later_life(
     assert sequences(tmp_path, warnings=warnings) == [1, 2, 3, 4, 5, 7, 8, 9]
 
 
+@pytest.mark.parametrize("number", [2, 3, 5, 6])
+def test_bytes_that_vanished_from_a_record_cost_that_record(tmp_path: Path, number: int) -> None:
+    start = damaged(tmp_path, number, 0) + HEAD.size + 50
+    path = segments(tmp_path)[1 if number <= 3 else 2]
+    content = path.read_bytes()
+    content = content[: start - HEAD.size - 50] + MAGIC + content[start - HEAD.size - 46 :]
+    path.write_bytes(content[:start] + content[start + 7 :])
+    warnings: list[str] = []
+    assert sequences(tmp_path, warnings=warnings) == [n for n in range(1, 7) if n != number]
+    assert len(warnings) == 1
+
+
 def starts(content: bytes) -> list[int]:
     """Where the title and each batch of a segment begin, and its end, as it was written."""
     at = [0]

@@ -108,8 +108,11 @@ def test_who_lost_the_folder_acknowledges_nothing_more(tmp_path: Path) -> None:
     assert path.exists()  # it is none of ours
 
 
-def test_one_that_was_tidied_up_or_damaged_is_made_again(tmp_path: Path) -> None:
+def test_one_that_was_tidied_up_or_damaged_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / LEASE
+    monkeypatch.setattr(lease_module, "STALE_S", 60.0)
     with RunFolder(tmp_path).lock() as claim:
         mine = path.read_text()
         for harm in (path.unlink, lambda: path.write_text("")):
@@ -131,6 +134,15 @@ def test_a_machine_that_was_suspended_looks_before_it_acknowledges(
             time, "clock_gettime", lambda clock: {time.CLOCK_BOOTTIME: slept}[clock]
         )
         with pytest.raises(FailedError, match="a process on far has taken it over"):
+            claim.check()
+
+
+def test_one_that_is_gone_after_a_long_silence_may_have_been_of_another(tmp_path: Path) -> None:
+    """It took the folder over from a suspended process, and ended: 68 batches were lost."""
+    with RunFolder(tmp_path).lock() as claim:
+        (tmp_path / LEASE).unlink()
+        time.sleep(2 * lease_module.STALE_S)
+        with pytest.raises(FailedError, match="a process on another machine has taken it over"):
             claim.check()
 
 

@@ -273,6 +273,28 @@ def test_of_another_master_the_index_counts_and_the_same_order_is_played_again(
         assert client.wait_for_order(order) == order
 
 
+def test_what_is_being_played_when_another_master_comes_is_played_once(master: StandIn) -> None:
+    order = Go(4, 9, 12, 3)
+    with welcomed(master) as client:
+        master.say(order)
+        assert client.wait_for_order(None) == order
+        master.say(master.welcome_message(epoch="another", index=5))
+        master.until(client, lambda: client.welcome.index == 5)
+        assert client.send(episodes(3), 9)
+        master.say(order)
+        master.until(client, lambda: client._order == order)
+        client.stop("played already")
+        assert client.wait_for_order(order) is None
+
+
+def test_a_master_that_went_on_in_another_mode_is_left(master: StandIn) -> None:
+    """It ordered nothing, and its worker waited for orders."""
+    with welcomed(master) as client:
+        master.say(master.welcome_message(epoch="another", lockstep=True))
+        with pytest.raises(TangramError, match=r"another service\.mode now: start this worker"):
+            master.until(client, lambda: False)
+
+
 def test_whoever_watches_sees_a_client_at_work(tmp_path: Path) -> None:
     seen: list[int] = []
     with make_client(tmp_path) as client:
