@@ -54,7 +54,8 @@ class Admission:
         counters: Counters,
         audit: Audit,
     ) -> None:
-        self.registry = Registry(info.fingerprints, 0.0 if info.lockstep else silence_s, room)
+        grace_s = 0.0 if info.lockstep else silence_s  # its orders name the first indices only
+        self.registry = Registry(info.fingerprints, grace_s, room)
         self._info, self._silence_s = info, silence_s
         self._sockets, self._counters, self._audit = sockets, counters, audit
 

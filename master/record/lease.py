@@ -87,14 +87,14 @@ class Lease:
             host, _, holder = _holder(self._path)
         except FileNotFoundError:
             host = holder = ""
+        silent, self._silent = self._silent, Every(STALE_S)
         if holder == self._id:
             os.utime(self._path)
-        elif holder or self._silent.due():  # after so long another may have had it, and ended
+        elif holder or silent.due():  # after so long another may have had it, and ended
             self._lost = host or "another machine"
         else:  # somebody deleted or damaged the file
             self._path.unlink(missing_ok=True)
             self._made()
-        self._silent = Every(STALE_S)
 
     def _made(self) -> bool:
         """Make the file; False if another process has one."""

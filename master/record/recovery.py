@@ -33,6 +33,7 @@ from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tangram_core.wire.schema import ProtocolError, opened, read
 
 CHUNK = 2**20
+MAX_GAP = 2**32  # a record whose number is further ahead than this is taken for damaged
 ANOTHER = "choose another run_dir, or delete its folder journal to go on without it"
 
 
@@ -122,6 +123,9 @@ class Reader:
         for found in _scan(path):
             self.torn = found.start if found.torn else None  # the last part decides
             where = f"{path} is damaged at byte {found.start:,}"
+            if found.number - self.number > MAX_GAP:
+                self._lost(f"{where} (it says that it is batch {found.number:,})")
+                continue
             if found.body is None:
                 size = f"{found.end - found.start:,} bytes"
                 torn = f"{path} is cut short at byte {found.start:,} ({size}), as a kill leaves it"
@@ -227,8 +231,7 @@ def _scan(path: Path) -> Iterator[_Found]:
                 yield _Found(start, end, number, body, torn=False)
             else:
                 told, end = end, min(end if head else size, _next_head(file, start + 1, size))
-                torn = end == size < told
-                yield _Found(start, end, number if told == end else 0, None, torn)
+                yield _Found(start, end, number if told == end else 0, None, end == size < told)
             start = end
 
 
@@ -237,22 +240,18 @@ def _read_head(head: bytes) -> tuple[int, int, int] | None:
     if len(head) < HEAD.size:
         return None
     magic, length, number, checksum, own = HEAD.unpack(head)
-    if magic != MAGIC or own != zlib.crc32(head[: -CRC.size]):
-        return None
-    return length, number, checksum
+    whole = magic == MAGIC and own == zlib.crc32(head[: -CRC.size])
+    return (length, number, checksum) if whole else None
 
 
 def _next_head(file: BinaryIO, start: int, size: int) -> int:
-    """Offset of the next intact head, or the size of the file."""
+    """Offset of the next head, damaged or not, or the size of the file."""
     file.seek(start)
     window = b""
     while chunk := file.read(CHUNK):
         window += chunk
-        at = window.find(MARK, HEAD.size)
-        while at >= 0:
-            if _read_head(window[at - HEAD.size : at]) is not None:
-                return start + at - HEAD.size
-            at = window.find(MARK, at + 1)
+        if (at := window.find(MARK, HEAD.size)) >= 0:
+            return start + at - HEAD.size
         passed = max(0, len(window) - HEAD.size - len(MARK) + 1)
         start, window = start + passed, window[passed:]
     return size

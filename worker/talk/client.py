@@ -226,9 +226,7 @@ class Client:
             order = self._order
             return order is not None and (self._again or order != done)
 
-        if not self._wait(is_new, "its turn"):
-            return None
-        return self._order
+        return self._order if self._wait(is_new, "its turn") else None
 
     def close(self) -> None:
         """Say BYE and close the connection; takes at most a second, even without a master."""

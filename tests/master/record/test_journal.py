@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master.record import journal as journal_module
+from master.record import recovery as recovery_module
 from master.record.delivery import EpisodesArrived
 from master.record.journal import FORMAT, HEAD, MAGIC, MARK, JournalError, Place, Title, segments
 from master.record.recovery import Reader, journal_run_id
@@ -248,6 +249,15 @@ def test_damage_at_the_end_is_no_torn_record_in_any_later_life(
         kept = journal(tmp_path, MADE, number=reader.number, torn=reader.torn)
         kept.append(arrival(MADE, 7 + life))
     assert sequences(tmp_path, warnings=warnings) == [1, 2, 3, 4, 5, 7, 8, 9]
+
+
+def test_the_next_record_is_found_wherever_a_chunk_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged(tmp_path, 1, 0)
+    for chunk in range(HEAD.size + 1, HEAD.size + 80):
+        monkeypatch.setattr(recovery_module, "CHUNK", chunk)
+        assert sequences(tmp_path, warnings=[]) == [2, 3, 4, 5, 6]
 
 
 @pytest.mark.parametrize("number", [2, 3, 5, 6])
@@ -485,6 +495,8 @@ FORGED: dict[str, tuple[dict[str, Any], str]] = {
     "role": ({"role": "judge"}, "batch: role must be one of player, evaluator, got 'judge'"),
     "kind": ({"kind": "bye"}, "expected batch, got a message of kind 'bye'"),
     "damage": ({"damage": 1}, "the message is damaged: its checksum is"),
+    "number": ({"number": 2**64 - 1}, "it says that it is batch 18,446,744,073,709,551,615"),
+    "mark": ({"mark": b""}, "the record has no mark"),
     "empty": ({"empty": 1}, "the header is not msgpack within the limits"),
 }
 
@@ -511,8 +523,10 @@ def test_a_forged_record_is_left_out_and_no_reason_to_throw_the_others_away(
     }
     [packed] = seal(str(entry.pop("kind")), entry, [])
     data = b"" if "empty" in change else join_frames(frames)
+    number = change.get("number", 2)
     with segments(tmp_path)[1].open("ab") as file:
-        file.write(record(b"" if "empty" in change else packed, data, 2))
+        mark = change.get("mark", MARK)
+        file.write(record(b"" if "empty" in change else packed, data, number, mark))
     kept.number = 2
     kept.append(arrival(MADE, 3))
     warnings: list[str] = []
