@@ -90,6 +90,7 @@ class Checkpointer:
         try:
             self._keep_safe()
             self._journal.append(arrival)
+            self._claim.check()  # the write may have hung for longer than a lease lasts
         except (JournalError, FolderError, DiskError) as error:
             self._failed(error)
             return False

@@ -233,7 +233,8 @@ class Studio:
     async def drop(self, request: Request) -> Response:
         """Fill a file that was dropped on the page."""
         size = request.headers.get("content-length", "")
-        if not size.isdecimal() or int(size) > MAX_UPLOAD:
+        chunked = "transfer-encoding" in request.headers  # of any size, whatever is declared
+        if chunked or not size.isdecimal() or int(size) > MAX_UPLOAD:
             limit = MAX_UPLOAD // 10**6
             return _refused(f"the file is larger than {limit} MB: make it smaller", 413)
         if self._uploads >= UPLOADS:

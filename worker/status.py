@@ -152,7 +152,7 @@ def _evaluator(connect: str) -> str:
 def _print_rows(console: Console, rows: Iterable[tuple[str, str]]) -> None:
     grid = Table.grid(padding=(0, 3))
     for name, text in rows:
-        grid.add_row(name, Text(text))
+        grid.add_row(Text(name), Text(text))
     console.print(grid, highlight=False)
 
 

@@ -56,17 +56,15 @@ class Room:
 
     @staticmethod
     def here() -> "Room":
-        """Raise this process's limit on open files as needed; ConfigError if no worker fits."""
-        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-        soft, hard = (MOST_FILES if n == resource.RLIM_INFINITY else n for n in limits)
-        room = Room(max(soft, min(hard, MOST_FILES)))
+        """Set this process's limit on open files; ConfigError if no worker fits."""
+        hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        room = Room(MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES))
         if room.peers < 1:
             raise ConfigError(
                 f"this process may open {room.files} files, too few for one worker: allow at "
                 f"least {RESERVE + HANDSHAKES + DESCRIPTORS} (ulimit -n)"
             )
-        if soft < room.files:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (room.files, limits[1]))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (room.files, hard))
         return room
 
     @property

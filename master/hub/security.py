@@ -277,5 +277,5 @@ class Authenticator:
         """Time and number of the key file, to detect changes; None if there is no file."""
         with suppress(OSError):
             found = (self.keys.path or Path()).stat()
-            return found.st_mtime_ns, found.st_ino
+            return found.st_ctime_ns, found.st_ino
         return None

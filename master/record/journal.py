@@ -34,7 +34,7 @@ import msgspec
 
 from master.record.delivery import EpisodesArrived
 from tangram_core.errors import RunError
-from tangram_core.run.process import Every
+from tangram_core.run.process import Every, still_alive
 from tangram_core.store.files import is_same, make_folders, sync_folder
 from tangram_core.wire.arrays import join_frames
 from tangram_core.wire.messages import Count, Id, Index, Number, Role
@@ -228,6 +228,7 @@ class Journal:
         try:
             # If the folder is not synced, a power cut can lose the name of the file.
             sync_folder(self._folder)
+            still_alive()  # FailedError if another machine began the segment by now
             self._write(file, _record(self._title, self.number, []))
             os.fsync(file.fileno())
         except OSError as error:

@@ -14,7 +14,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from tangram_core.errors import TangramError, UnavailableError
+from tangram_core.errors import FailedError, UnavailableError
 from tangram_core.run.process import Every, still_alive, watching
 
 RENEW_S = 10.0
@@ -23,10 +23,6 @@ LOOK_S = 1.0
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # host names may be equal on several machines
 
 log = logging.getLogger(__name__)
-
-
-class LostError(TangramError):
-    """A process on another machine has taken the folder over."""
 
 
 def is_elsewhere(path: Path) -> bool:
@@ -52,47 +48,44 @@ class Lease:
         self._due, self._lost, self._silent = Every(RENEW_S), "", Every(STALE_S)
         try:
             while not self._made():
-                with suppress(FileNotFoundError):  # another process was quicker
+                with suppress(FileNotFoundError, FileExistsError):  # another was quicker
                     self._take_away(self._await_silence())
         except OSError as error:
             why = error.strerror
             log.warning("%s cannot be written (%s): other machines are not seen", path, why)
-        watching.append(self._keep)  # writing a checkpoint may take longer than STALE_S
+        watching.append(self.renew)  # writing a checkpoint may take longer than STALE_S
 
     def renew(self) -> None:
         """Touch the file if that is due.
 
         Raises:
-            LostError: another machine has the folder now; each later call raises this again.
+            FailedError: another machine has the folder now; each later call raises this again.
         """
         if not self._lost and self._due.due():
             with suppress(OSError):
                 self._renew()
         if self._lost:
-            raise LostError(f"a process on {self._lost} has taken it over")
+            lost = f"run_dir {self._path.parent} is lost"
+            raise FailedError(f"{lost}: a process on {self._lost} has taken it over")
 
     def close(self) -> None:
         """Delete the file if this process still has the lease."""
-        watching.remove(self._keep)
+        watching.remove(self.renew)
         with suppress(OSError):
             if _holder(self._path)[2] == self._id:
                 self._path.unlink()
 
-    def _keep(self) -> None:
-        with suppress(LostError):  # the next call of `renew` raises it again
-            self.renew()
-
     def _renew(self) -> None:
         try:
-            host, _, holder = _holder(self._path)
+            host, machine, holder = _holder(self._path)
         except FileNotFoundError:
-            host = holder = ""
+            host, machine, holder = "", self._machine, ""
         silent, self._silent = self._silent, Every(STALE_S)
         if holder == self._id:
             os.utime(self._path)
-        elif holder or silent.due():  # after so long another may have had it, and ended
+        elif machine != self._machine or silent.due():  # another may have had it, and ended
             self._lost = host or "another machine"
-        else:  # somebody deleted or damaged the file
+        else:  # deleted, damaged, or of a process that has ended
             self._path.unlink(missing_ok=True)
             self._made()
 

@@ -17,8 +17,8 @@ import yaml
 
 from master.config import MasterConfig
 from master.record.journal import segments
-from master.record.lease import Lease, LostError, is_elsewhere
-from tangram_core.errors import ConfigError, FailedError, RunError, UnavailableError
+from master.record.lease import Lease, is_elsewhere
+from tangram_core.errors import ConfigError, RunError, TangramError, UnavailableError
 from tangram_core.run.code import code_of, own_code, read_code
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.run.outcome import bound_of, read_outcome
@@ -210,8 +210,6 @@ class Claim:
                 raise FolderError(f"run_dir {path} was replaced by a folder with another run")
             before, lease = (self._lock, self._folder), self._lease
             self._take()
-        except LostError as error:
-            raise FailedError(f"run_dir {path} is lost: {error}") from None
         except (OSError, ConfigError, UnavailableError) as error:
             why = error.strerror if isinstance(error, OSError) else "another process uses it"
             raise FolderError(f"run_dir {path} cannot be locked again ({why})") from None
@@ -244,7 +242,7 @@ class Claim:
                 f"{self.run.path / self._name} cannot be locked by flock ({error.strerror}): "
                 "choose a run_dir on a file system that has locks"
             ) from None
-        except UnavailableError:
+        except TangramError:
             lock.close()
             raise
         # The folder stays open, so that its inode number is not used for another folder.

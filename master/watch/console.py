@@ -243,10 +243,10 @@ def _scores(status: RunStatus) -> str:
     return found or (f"players' reward {n[PLAYED]:.3f}" if PLAYED in n else "")
 
 
-def _cells(status: RunStatus) -> list[tuple[str, str | Text]]:
+def _cells(status: RunStatus) -> list[tuple[str | Text, str | Text]]:
     """Label and value of each score, the first one highlighted, filled up to an even number."""
-    cells = list[tuple[str, str | Text]]()
+    cells = list[tuple[str | Text, str | Text]]()
     for score in read(status.texts.get("scores", "")):
         shown = score.shown(status.numbers.get(TEST + score.name))
-        cells.append((score.label, shown if cells else Text(shown, style="bold green")))
+        cells.append((Text(score.label), shown if cells else Text(shown, style="bold green")))
     return cells + [("", "")] * (len(cells) % 2)

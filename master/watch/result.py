@@ -14,6 +14,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from master.config import MasterConfig
 from master.record.rundir import RunFolder
@@ -78,7 +79,7 @@ def show_result(
     table.add_column(style="dim", no_wrap=True)
     table.add_column(no_wrap=True)
     for name, text in outcome_rows(result):
-        table.add_row(name, text)
+        table.add_row(Text(name), Text(text))
     console.print()
     console.print(table)
     console.print()

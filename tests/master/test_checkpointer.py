@@ -16,6 +16,7 @@ import torch
 
 from master.checkpointer import AT_ONCE, MAKE_ROOM, WAIT, restore_run
 from master.learn.trainer import Trainer
+from master.record import journal as journal_module
 from master.record.journal import JournalError, segments
 from master.record.recovery import Reader
 from master.record.rundir import LEASE, RunFolder
@@ -283,6 +284,29 @@ def test_a_master_whose_run_another_machine_has_taken_over_ends(stage: Stage) ->
         assert end.value.status == 1  # the launcher starts it again, and it waits
     run.remove_connection()
     assert run.connection.read_text() == "theirs"
+
+
+@pytest.mark.parametrize("hung", ["append", "rotate", "sync_folder"])
+def test_who_hung_for_longer_than_a_lease_lasts_writes_and_acknowledges_nothing(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch, hung: str
+) -> None:
+    """Another machine has read what is on the disk, and goes on from there."""
+    checkpointer = stage.checkpointer
+    checkpointer._claim._lease._due = Every(0.0)
+    place: object = journal_module if hung == "sync_folder" else checkpointer._journal
+    real = getattr(place, hung)
+
+    def hangs(*arguments: object) -> object:
+        done = real(*arguments)
+        (stage.folder / LEASE).write_text(json.dumps({"host": "far", "id": "theirs"}))
+        return done
+
+    monkeypatch.setattr(place, hung, hangs)
+    with pytest.raises(FailedError, match="is lost: a process on far has taken it over"):
+        checkpointer.save() if hung == "rotate" else stage.keep(1)
+    assert not list_checkpoints(stage.folder / "checkpoints")
+    [segment] = segments(stage.folder / "journal").values()
+    assert (segment.stat().st_size == 0) == (hung == "sync_folder")
 
 
 def test_a_second_master_in_a_folder_that_was_made_anew_keeps_it(stage: Stage) -> None:

@@ -12,8 +12,10 @@ import zmq
 
 from master.hub.security import make_keys, make_pair
 from tangram_core.errors import RunError, TangramError
+from tangram_core.scores import written
 from tangram_core.wire.messages import RunStatus
 from tests.master.hub.dealers import Stage, staged
+from tests.master.watch.test_console import BRACKETS
 from tests.master.watch.test_health import STATUS
 from tests.master.watch.test_result import RESULT
 from tests.worker.talk.conversation import served
@@ -68,6 +70,10 @@ def test_a_finished_run_shows_its_result(
     assert re.search(r"ended by +max_updates=1234", shown)
     assert show_status(StatusConfig(str(tmp_path), json=True)) == 0
     assert json.loads(capsys.readouterr().out) == RESULT
+    speed = {"scores": written([BRACKETS]), "speed": 1.5, "scored_updates": 1234}
+    path.write_text(json.dumps(RESULT | speed))
+    assert show_status(config) == 0
+    assert re.search(r"speed \[m/s\] \[/\] +1\.500", capsys.readouterr().out)
     changes: list[dict[str, object]] = [
         {"wall_s": "x"},
         {"wall_s": float("inf")},

@@ -64,8 +64,7 @@ class Timing:
 class Sockets:
     """A DEALER socket for messages, and a SUB socket that keeps only the newest weights.
 
-    Each DEALER gets a new identity, because a ROUTER ignores a second connection with an identity
-    that seems to be still connected.
+    Each DEALER has an identity that nobody can guess. A connection that it opens again keeps it.
     """
 
     def __init__(

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from master.record import lease as lease_module
-from master.record.lease import BOOT, Lease, LostError
-from master.record.rundir import LEASE, FolderError, RunFolder
+from master.record.lease import BOOT, Lease
+from master.record.rundir import LEASE, RunFolder
 from tangram_core.errors import ConfigError, FailedError, UnavailableError
 from tangram_core.run.process import still_alive
 
@@ -35,6 +35,10 @@ def of_another(folder: Path, age_s: float = 0.0, host: str = "far", machine: str
     path.write_text(json.dumps(content) if host else "")
     os.utime(path, (time.time() - age_s,) * 2)
     return path
+
+
+def full(*_: object) -> int:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @contextmanager
@@ -66,8 +70,7 @@ def test_a_process_of_another_machine_that_lives_keeps_its_folder(
         assert json.loads(path.read_text())["id"] != "theirs"
         claim.run.path.joinpath(".lock").unlink()
         of_another(tmp_path)
-        told = r"cannot be locked again \(another process uses it\)"
-        with living(path), pytest.raises(FolderError, match=told):
+        with living(path), pytest.raises(FailedError, match="lost: a process on far"):
             claim.check()
 
 
@@ -146,10 +149,11 @@ def test_one_that_is_gone_after_a_long_silence_may_have_been_of_another(tmp_path
             claim.check()
 
 
-def test_of_two_that_take_an_old_one_away_one_has_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("third", [False, True])
+def test_of_those_that_take_an_old_one_away_one_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, third: bool
 ) -> None:
-    """The other made its own after this one had looked."""
+    """The other made its own after this one had looked; a third while this one has that aside."""
     path, real, theirs = of_another(tmp_path, 1000.0), Lease._await_silence, list[str]()
 
     def late(self: Lease) -> os.stat_result:
@@ -158,11 +162,18 @@ def test_of_two_that_take_an_old_one_away_one_has_it(
             theirs.append("theirs, new")
             path.unlink()
             path.write_text(json.dumps({"host": "far", "id": theirs[0]}))
-        else:  # put back; its process ends now
-            assert json.loads(path.read_text())["id"] == theirs[0]
+        else:  # put back, unless there is a third; its process ends now
+            assert json.loads(path.read_text())["id"] == ("third" if third else theirs[0])
         return judged
 
+    def link(source: Path, target: Path) -> None:
+        if third and theirs and not path.exists() and theirs[0] in source.read_text():
+            path.write_text(json.dumps({"host": "far", "id": "third"}))
+        real_link(source, target)
+
     monkeypatch.setattr(Lease, "_await_silence", late)
+    real_link = os.link
+    monkeypatch.setattr(os, "link", link)
     mine = Lease(path)
     assert json.loads(path.read_text())["id"] == mine._id
     assert [one.name for one in tmp_path.iterdir()] == [LEASE]
@@ -171,9 +182,6 @@ def test_of_two_that_take_an_old_one_away_one_has_it(
 def test_a_full_disk_is_no_reason_to_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     monkeypatch.setattr(Path, "write_text", full)
     lease = Lease(tmp_path / LEASE)
     began_s = time.clock_gettime(time.CLOCK_BOOTTIME)
@@ -197,6 +205,18 @@ def test_a_file_system_without_locks_is_told(
         RunFolder(tmp_path).lock()
 
 
+def test_one_that_a_full_disk_kept_from_its_successor_on_this_machine_ends_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_another(tmp_path, machine=BOOT.read_text().strip())  # killed: the lock shows that it ended
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full)
+        claim = RunFolder(tmp_path).lock()
+    with claim:
+        assert claim.check() is False
+        assert json.loads((tmp_path / LEASE).read_text())["id"] != "theirs"
+
+
 def test_it_is_renewed_while_a_checkpoint_is_written_and_no_longer_than_it_is_held(
     tmp_path: Path,
 ) -> None:
@@ -205,9 +225,8 @@ def test_it_is_renewed_while_a_checkpoint_is_written_and_no_longer_than_it_is_he
     still_alive()
     assert (tmp_path / LEASE).stat().st_mtime > 0.0
     of_another(tmp_path)
-    still_alive()
-    with pytest.raises(LostError, match="a process on far has taken it over"):
-        lease.renew()
+    with pytest.raises(FailedError, match="a process on far has taken it over"):
+        still_alive()  # nothing more may be written
     lease.close()
     assert (tmp_path / LEASE).exists()
     os.utime(tmp_path / LEASE, (0.0, 0.0))

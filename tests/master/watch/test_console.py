@@ -22,7 +22,7 @@ from master.watch.console import (
     status_panel,
 )
 from tangram_core.run.outcome import duration
-from tangram_core.scores import SHOWN, written
+from tangram_core.scores import SHOWN, Score, written
 from tangram_core.wire.messages import OPEN, WORKER_COLUMNS, RunStatus
 from tangram_tasks.place import ONE_TOKEN
 from tests.master.builders import screen, text
@@ -49,6 +49,7 @@ STATUS = RunStatus(
     {"activity": "learning", "scores": json.dumps(written(ONE_TOKEN[:SHOWN]))},
     np.zeros((0, len(WORKER_COLUMNS))),
 )
+BRACKETS = Score("speed", "speed [m/s] [/]")  # no markup
 UNSCORED = {name: value for name, value in STATUS.numbers.items() if "/" not in name}
 FRESH = replace(STATUS, numbers=UNSCORED | {"share": -1.0, "left_s": -1.0, "players": 1})
 
@@ -90,6 +91,16 @@ def test_durations(seconds: float, shown: str) -> None:
             "1:23 | 12,345 episodes | 1,234 updates | 950 transitions/s | 95.1 updates/s | "
             "players' reward -0.250 | 1 worker | learning",
             ["players' reward", "-0.250", "no evaluator: start one with tangram-worker connect=r"],
+        ),
+        (
+            replace(
+                FRESH,
+                numbers=FRESH.numbers | {"test/speed": 1.5},
+                texts=FRESH.texts | {"scores": json.dumps(written([BRACKETS]))},
+            ),
+            "1:23 | 12,345 episodes | 1,234 updates | 950 transitions/s | 95.1 updates/s | "
+            "speed [m/s] [/] 1.500 | 1 worker | learning",
+            ["speed [m/s] [/]", "1.500"],
         ),
     ],
 )

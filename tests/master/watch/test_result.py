@@ -13,6 +13,7 @@ from master.watch.result import go_on_command, show_result
 from tangram_core.scores import written
 from tangram_tasks.place import ONE_TOKEN
 from tests.master.builders import screen, text
+from tests.master.watch.test_console import BRACKETS
 
 pytestmark = pytest.mark.fast
 
@@ -45,6 +46,11 @@ RESULT = dict.fromkeys(score.name for score in ONE_TOKEN) | {
             ["weights after"],
         ),
         (SCORED | {"scored_updates": 1000}, ["weights after 1,000 updates"], ["go on"]),
+        (
+            {"scores": written([BRACKETS]), "speed": 1.5, "scored_updates": 1234},
+            ["speed [m/s] [/]", "1.500"],
+            [],
+        ),
         ({"ended_by": "SIGINT"}, ["Ctrl-C (SIGINT)", "go on           tangram-train r"], []),
     ],
 )
