@@ -170,7 +170,6 @@ class Sockets:
         if kind == zmq.ROUTER:
             # Without this, answers to lost connections are dropped without an error.
             socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
-            socket.setsockopt(zmq.ROUTER_HANDOVER, 1)  # else a new connection waits for the old
         if self._authenticator is not None:
             self._authenticator.guard(socket)
         host = f"[{bind}]" if ":" in bind else bind

@@ -6,10 +6,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack
 
 import pytest
-import zmq
 
 from master.hub.gate import _connection
 from master.hub.sockets import Sockets
@@ -62,23 +60,6 @@ def test_a_connection_that_died_without_a_word_is_found() -> None:
                 assert {option: found.getsockopt(*option) for option in wanted} == wanted
     finally:
         sockets.close()
-
-
-def test_who_connects_again_is_heard_though_its_old_connection_seems_open() -> None:
-    """As after a revocation, which ends all connections: ZeroMQ connects again by itself."""
-    sockets = Sockets("127.0.0.1", 0, Counters())
-    with zmq.Context() as context, ExitStack() as opened:
-        opened.callback(sockets.close)
-        for number in (b"1", b"2"):
-            dealer = opened.enter_context(context.socket(zmq.DEALER))
-            dealer.setsockopt(zmq.LINGER, 0)
-            dealer.setsockopt(zmq.IDENTITY, b"w")
-            dealer.connect(sockets.endpoint)
-            dealer.send(number)
-            assert sockets.wait(10)
-            received = sockets.receive()
-            assert received is not None
-            assert [bytes(frame) for frame in received[1]] == [number]
 
 
 # Two masters that do not read for a while, as while one learns; their pings would come after 5 s.

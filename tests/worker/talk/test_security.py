@@ -415,6 +415,23 @@ def test_connections_of_a_revoked_key_end_also_those_that_say_nothing(
             assert client.counters["reconnects"] == 0
 
 
+def test_who_connects_again_is_heard_at_once(tmp_path: Path, file: Path) -> None:
+    """A ROUTER holds a connection that was cut until the hub has read, which learning delays."""
+    keys = read_keys(file)
+    with staged(keys=keys) as stage, make_client(write_file(tmp_path, stage.hub, keys)) as client:
+        assert served(stage, client.join)
+        gate = stage.hub._sockets._gate
+        assert gate is not None
+        before, end_s = set(gate._open), time.monotonic() + 10
+        gate.end_all(stage.hub.endpoint)
+        while not gate._open - before and time.monotonic() < end_s:
+            time.sleep(0.01)
+        time.sleep(0.2)  # the handshake; where it takes longer, this test tells nothing
+        client.send(episodes(), 0)
+        both(stage, client, stage.batches)
+        assert client.counters["reconnects"] == 0
+
+
 def test_a_key_that_is_revoked_while_the_master_starts_is_not_valid(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -502,8 +519,8 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
             client.newest_weights()
             client.send(episodes(), 0)
             both(stage, client, lambda: publish() or client.newest_weights())
-            stage.until(stage.batches)
+            both(stage, client, stage.batches)
             assert client.counters["reconnects"] == 0
             assert not beside.poll(500)
     again = {"event": "refused", "key": "bob", "address": "127.0.0.1", "reason": "revoked"}
-    assert again.items() <= lines(tmp_path / "audit.jsonl")[-1].items()
+    assert any(again.items() <= line.items() for line in lines(tmp_path / "audit.jsonl"))
