@@ -2,6 +2,7 @@
 
 import logging
 import math
+import secrets
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -63,8 +64,8 @@ class Timing:
 class Sockets:
     """A DEALER socket for messages, and a SUB socket that keeps only the newest weights.
 
-    The ROUTER names each connection. A DEALER that named itself would be ignored after a connection
-    was cut, for as long as the ROUTER holds the old one.
+    Each DEALER gets a new identity, because a ROUTER ignores a second connection with an identity
+    that seems to be still connected.
     """
 
     def __init__(
@@ -79,6 +80,8 @@ class Sockets:
         self._poller = zmq.Poller()
         self._ready: set[zmq.Socket[bytes]] = set()
         self._dealer = self._open(zmq.DEALER)
+        # ZeroMQ forbids identities that begin with a zero byte.
+        self._dealer.setsockopt(zmq.IDENTITY, b"w" + secrets.token_bytes(16))
         self._monitor = self._dealer.get_monitor_socket(HANDSHAKES)
         self._poller.register(self._monitor, zmq.POLLIN)
         self._connect(self._dealer, address.endpoint)

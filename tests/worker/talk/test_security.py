@@ -415,23 +415,6 @@ def test_connections_of_a_revoked_key_end_also_those_that_say_nothing(
             assert client.counters["reconnects"] == 0
 
 
-def test_who_connects_again_is_heard_at_once(tmp_path: Path, file: Path) -> None:
-    """A ROUTER holds a connection that was cut until the hub has read, which learning delays."""
-    keys = read_keys(file)
-    with staged(keys=keys) as stage, make_client(write_file(tmp_path, stage.hub, keys)) as client:
-        assert served(stage, client.join)
-        gate = stage.hub._sockets._gate
-        assert gate is not None
-        before, end_s = set(gate._open), time.monotonic() + 10
-        gate.end_all(stage.hub.endpoint)
-        while not gate._open - before and time.monotonic() < end_s:
-            time.sleep(0.01)
-        time.sleep(0.2)  # the handshake; where it takes longer, this test tells nothing
-        client.send(episodes(), 0)
-        both(stage, client, stage.batches)
-        assert client.counters["reconnects"] == 0
-
-
 def test_a_key_that_is_revoked_while_the_master_starts_is_not_valid(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
