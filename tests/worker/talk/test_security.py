@@ -294,9 +294,13 @@ def test_a_worker_on_another_machine_is_told_where_the_master_listens(tmp_path: 
 # Keys of one role, of one person, and for a while
 
 
+NEWS = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
+
+
 def raw(stage: Stage, keys: Keys, pair: Pair, name: bytes = b"", kind: int = zmq.DEALER) -> Any:
     """A connection with a key, and perhaps with a name of its own; or a subscription."""
     end, hub = stage._open(kind), stage.hub
+    end.get_monitor_socket(NEWS)  # before it connects: the first news may be out by the next line
     end.setsockopt(zmq.LINGER, 0)
     if name:
         end.setsockopt(zmq.IDENTITY, name)
@@ -393,7 +397,7 @@ def test_connections_of_a_revoked_key_end_also_those_that_say_nothing(
     keys, bob = read_keys(file), give(file, "bob")
     with staged(keys=read_keys(file)) as stage:
         silent = raw(stage, keys, bob)
-        news = silent.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
+        news = silent.get_monitor_socket()
         with make_client(write_file(tmp_path, stage.hub, keys)) as client:
             assert served(stage, client.join)
             stage.until(lambda: news.poll(0))
@@ -502,8 +506,8 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
             client.newest_weights()
             client.send(episodes(), 0)
             both(stage, client, lambda: publish() or client.newest_weights())
-            both(stage, client, stage.batches)
+            stage.until(stage.batches)
             assert client.counters["reconnects"] == 0
             assert not beside.poll(500)
     again = {"event": "refused", "key": "bob", "address": "127.0.0.1", "reason": "revoked"}
-    assert any(again.items() <= line.items() for line in lines(tmp_path / "audit.jsonl"))
+    assert again.items() <= lines(tmp_path / "audit.jsonl")[-1].items()
