@@ -45,11 +45,18 @@ class Score:
 
     def shown(self, value: float | None) -> str:
         """The value as text with its unit; - for None."""
-        return "-" if value is None else f"{value:.{self.digits}f}{self.unit}"
+        return "-" if value is None else f"{decimal(value, self.digits)}{self.unit}"
 
     def told(self, value: float) -> str:
         """The label and the value as text."""
         return f"{self.label} {self.shown(value)}"
+
+
+def decimal(value: float, digits: int = 3) -> str:
+    """A number with `digits` decimals, or with more where it would look like a full 1: 0.9995."""
+    text = f"{value:.{digits}f}"
+    seems_full = value < 1 and float(text) == 1 and digits < MAX_DIGITS
+    return decimal(value, digits + 1) if seems_full else text
 
 
 def written(scores: Iterable[Score]) -> list[list[Any]]:

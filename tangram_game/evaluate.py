@@ -17,7 +17,7 @@ from tangram_agent.runs import Run, load_changed
 from tangram_core.agent import AT_ONCE
 from tangram_core.errors import ConfigError
 from tangram_core.run.outcome import plural
-from tangram_core.scores import Score
+from tangram_core.scores import Score, decimal
 from tangram_core.store.files import write_whole
 from tangram_core.task import Task
 from tangram_game.config import ALL, EvalConfig, source_and_names
@@ -213,7 +213,7 @@ def puzzles_table(puzzles: Sequence[Mapping[str, Any]], full: str | None) -> Tab
         table.add_column(name, justify="left" if name in ("puzzle", "") else "right")
     for one in puzzles[:MAX_LINES]:
         name = f"{one['name']} {one['degrees']:g}°" if one["degrees"] else str(one["name"])
-        shares = (f"{one[key]:.3f}" for key in ("coverage", "iou"))
+        shares = (decimal(one[key]) for key in ("coverage", "iou"))
         unfilled = "" if one.get("filled", True) else "not filled"
         end = "solved" if one["solved"] else unfilled
         table.add_row(name, *shares, *(str(one[count]) for count in counts), end)

@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass
 
+from tangram_core.scores import decimal
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.targets.targets import has_all_tans
@@ -61,12 +62,12 @@ def answer(
     drawn = fill_silhouette(name, source, layout, scale, seconds)
     filled = drawn.filled
     if filled.found is not None and filled.solved:
-        told = f"filled by the {filled.by} in {filled.seconds:.2f} s, IoU {filled.iou:.3f}"
+        told = f"filled by the {filled.by} in {filled.seconds:.2f} s, IoU {decimal(filled.iou)}"
         taken = time.thread_time() - begin
         return Answer(drawn, filled.found, True, filled.iou, told, taken)
     starts = [one for one in (filled.found, filled.attempt) if one is not None]
     found, iou = nearest_figure(drawn.area, layout, NEAREST_SECONDS, starts=starts)
-    told = f"{_unfilled(drawn, layout)}; the nearest figure has IoU {iou:.3f} with it"
+    told = f"{_unfilled(drawn, layout)}; the nearest figure has IoU {decimal(iou)} with it"
     return Answer(drawn, found, False, float(iou), told, time.thread_time() - begin)
 
 

@@ -10,6 +10,7 @@ from PIL import Image
 
 from tangram_core.arrays import Bools, Floats, Ints
 from tangram_core.run.outcome import plural
+from tangram_core.scores import decimal
 from tangram_sim.drawing.game_drawing import Held, captions, draw_game, tiles
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.geometry.layout import Layout
@@ -47,7 +48,7 @@ class Show:
         """Number of episodes, mean score and note, as one line of text."""
         mean = float(self.played.overlap.mean())
         note = f"; {self.note}" if self.note else ""
-        return f"{plural(len(self.titles), self.kind)}, coverage {mean:.3f}{note}"
+        return f"{plural(len(self.titles), self.kind)}, coverage {decimal(mean)}{note}"
 
 
 def frames_per_action(horizon: int) -> int:

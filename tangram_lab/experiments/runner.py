@@ -16,6 +16,7 @@ from master.signals import SIGNALS
 from tangram_core.errors import ConfigError
 from tangram_core.run.code import override
 from tangram_core.run.process import handling
+from tangram_core.scores import decimal
 from tangram_core.store.files import write_whole
 from tangram_lab.experiments.rows import (
     COLUMNS,
@@ -107,7 +108,7 @@ class Work:
             append(folder / f"{study}_curves.csv", CURVE, points)
         append(folder / f"{study}.csv", COLUMNS, rows)
         reward = result.get("mean_reward")
-        return "done" if reward is None else f"mean reward {reward:.3f}"
+        return "done" if reward is None else f"mean reward {decimal(reward)}"
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from tangram_core.arrays import Floats, Singles
+from tangram_core.scores import decimal
 from tangram_sim.drawing.strokes import (
     PAPER,
     SAMPLES,
@@ -97,7 +98,7 @@ def episode_sheet(
         for start, end, goal in zip(starts, ends, goals, strict=True)
     ]
     covered = covered_share(ends, goals, layout) if shares is None else shares
-    captions = [f"coverage  {share:.3f}" for share in covered]
+    captions = [f"coverage  {decimal(share)}" for share in covered]
     sheet = contact_sheet(scenes, columns, captions)
     return with_legend(sheet, max(size // 18, SMALLEST_TEXT))
 

@@ -65,6 +65,15 @@ def test_durations(seconds: float, shown: str) -> None:
 
 @pytest.mark.fast
 @pytest.mark.parametrize(
+    ("value", "shown"),
+    [(0.99952, "0.9995"), (0.9994, "0.999"), (0.999999999999, "1.000000000"), (1.0, "1.000")],
+)
+def test_a_share_below_one_is_not_shown_as_one(value: float, shown: str) -> None:
+    assert Score("coverage", "coverage").shown(value) == shown
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
     ("status", "line", "words"),
     [
         (
