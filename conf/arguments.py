@@ -1,4 +1,4 @@
-"""Checks of a command's arguments before hydra reads them; what it would misread is refused."""
+"""Checks a command's arguments before hydra reads them, and refuses what hydra would misread."""
 
 from collections.abc import Sequence
 from pathlib import Path

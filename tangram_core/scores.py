@@ -39,8 +39,9 @@ class Score:
         fits = len(self.label) <= MAX_LABEL and len(self.unit) <= MAX_UNIT
         if not (fits and 0 <= self.digits <= MAX_DIGITS):
             raise ConfigError(
-                f"score {self.name}: a label has at most {MAX_LABEL} characters, a unit "
-                f"{MAX_UNIT}, and {MAX_DIGITS} digits are shown: make them shorter"
+                f"score {self.name}: label may have {MAX_LABEL} characters, unit {MAX_UNIT}, and "
+                f"digits be 0 to {MAX_DIGITS}, got {len(self.label)}, {len(self.unit)} and "
+                f"{self.digits}: correct them"
             )
 
     def shown(self, value: float | None) -> str:

@@ -169,7 +169,7 @@ def _with_figures(settings: Plain) -> Plain:
     own = changes.get("task", {})
     if "puzzle" in own:
         raise ConfigError(
-            "puzzle= and task.puzzle= are one setting in task=push: leave one of both out"
+            "puzzle= and task.puzzle= are the same setting in task=push: leave one of them out"
         )
     own = own | {"puzzle": list(puzzle)}
     return settings | {"puzzle": None, "changes": changes | {"task": own}}

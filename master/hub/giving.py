@@ -78,7 +78,7 @@ def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[s
     out = Path(config.out or f"{name}.json").absolute()
     if name in ROLES or name in keys.given:
         raise ConfigError(
-            f"{name} has a key already: revoke that key first, or choose another name"
+            f"{name} has a key already: choose another name, or revoke it first if you made it"
         )
     if not NAME.fullmatch(name):
         raise ConfigError(

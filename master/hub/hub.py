@@ -52,7 +52,7 @@ from tangram_core.wire.messages import (
 )
 from tangram_core.wire.schema import DamagedError, ProtocolError
 
-# Time of one poll for reading and for answering under any load, so that the loop goes on.
+# Longest time for reading and for answering in one poll, so that load does not stop the loop.
 READ_S, SERVE_S = 0.005, 0.01
 MESSAGE_S = 0.1  # largest cost counted for one message; if longer, the process was stopped
 # Most bytes of one key that are read but not answered. Messages beyond that are dropped, and a
@@ -186,7 +186,7 @@ class Hub:
         self.counters["published"] += 1
 
     def order(self, orders: Mapping[int, Go]) -> None:
-        """In lockstep: send each player (by index) its order, again until its batch comes."""
+        """In lockstep: send each player (by index) its order, repeated until its batch arrives."""
         self._orders = dict(orders)
         for peer in self.peers:
             self._remind(peer)

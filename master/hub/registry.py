@@ -16,9 +16,9 @@ from tangram_core.errors import RunError, TangramError
 from tangram_core.wire.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_core.wire.schema import MAX_COUNT
 
-# A peer that asks again for weights and does not show that it got them waits so long, then twice.
+# Pause before weights are sent again to a peer that has not shown them; doubled each time.
 WEIGHTS_AGAIN_S = 10.0
-# Status answers to one key in STATUS_AGAIN_S: so many in all, and one for each connection.
+# Most status answers to one key in STATUS_AGAIN_S; one connection gets one in that time.
 STATUS_ANSWERS, STATUS_AGAIN_S = 64, 0.5
 ANOTHER_KEY = "takes part with another key: leave index out, or choose another"
 OWN = ("", *ROLES)  # names of the run's own keys, and of no key

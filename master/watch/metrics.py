@@ -117,7 +117,7 @@ class Metrics:
             log.warning("%s cannot be written (%s): a score is missing", self._curve, why)
 
     def picture(self, pixels: Pixels, updates: int) -> None:
-        """Write the picture of the test episodes, (height, width, 3), after so many updates."""
+        """Write the picture (height, width, 3) of the test episodes after `updates` updates."""
         content = np.asarray(pixels)
         self._try(
             lambda: self._writer.add_image("test/pictures", content, updates, dataformats="HWC")

@@ -103,7 +103,7 @@ class Ddpg(TokenLearner):
         return super().rates(share)._replace(actor=actor)
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:
-        """Add the played and the relabelled transitions to the replay buffer."""
+        """Add the played and the relabelled transitions; see `Learner.insert`."""
         seen, task = learnable(episodes), self.task
         if seen.count:
             relabelled = self.relabels, task.layout, task.reward_of, rng["hindsight"]

@@ -100,8 +100,7 @@ class EpisodeReplay(Ring):
     ) -> tuple[Array, Bools]:
         """Goals (B, ...) of steps (B,) in episodes with ends (B,), and whether each is relabelled.
 
-        A step might have been made for a goal that was achieved later, and the task gives its
-        reward for that goal (Andrychowicz et al. 2017).
+        A relabelled step gets a goal that its episode achieved later (Andrychowicz et al. 2017).
         """
         other = rng.random(len(rows)) < config.relabel_share
         moments = later(steps, ends, rng)

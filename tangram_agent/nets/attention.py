@@ -12,7 +12,7 @@ from tangram_agent.base.config import HEADS, NetConfig
 
 # Added to the scores of nodes without an edge: finite, but the exponential is exactly zero.
 NO_EDGE = -1e30
-# Up to so many nodes torch's own softmax is slower than the plain formula.
+# With at most this many nodes, torch's own softmax is slower than the plain formula.
 SHORT_ROW = 16
 
 

@@ -135,7 +135,7 @@ def read_code(setting: str, given: str, path: Path, sha256: str | None = None) -
 
 
 def load_code(setting: str, given: str, path: Path, name: str, source: bytes) -> Any:
-    """The object with a name in a user's file, which is executed at the first call.
+    """The object `name` of a user's file; the file is executed at the first call.
 
     Raises:
         ConfigError: the file cannot be loaded, or has no such name.

@@ -3,8 +3,8 @@
 No orphans: a child process ends when its parent is gone, for whatever reason. The parent keeps the
 write end of a pipe for each child and passes it to no process, so the kernel closes it even after
 SIGKILL. The child inherits the read end, whose number is in an environment variable. A thread of
-the child waits there for the end of the file. Lines that the parent writes before are news for the
-child's user, since two processes must not draw on one terminal.
+the child waits there for the end of the file. The parent may write lines before, which the child
+shows to the user, since two processes must not draw on one terminal.
 """
 
 import ctypes

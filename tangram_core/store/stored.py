@@ -13,7 +13,7 @@ MAX_DEPTH = 20
 
 
 def load_settings(text: str, source: str) -> Any:
-    """The content of a YAML text; ConfigError if it is not YAML, or larger than settings are."""
+    """The content of a YAML text; ConfigError if it is not valid or too large."""
     try:
         check_extent(text, source)
         return yaml.safe_load(text)

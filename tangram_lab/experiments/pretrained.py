@@ -70,7 +70,7 @@ def publish(
         ConfigError: the name is invalid, or the folder cannot be written.
     """
     if not (name.isascii() and name.isidentifier() and name == name.lower()):
-        raise ConfigError(f"name must be small letters, digits and _, got '{name}'")
+        raise ConfigError(f"name must be a-z, 0-9 (not in front) and _, got '{name}'")
     check_writable("--out", (target / name / CARD).absolute())
     seeds = sorted((_read(path) for path in run_dirs), key=lambda one: int(one.result["seed"]))
     _check_one_setup(seeds)

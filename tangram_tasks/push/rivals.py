@@ -39,7 +39,7 @@ WRONG = 2.0  # factor by which planner_wrong errs about friction
 
 
 class Planner:
-    """A policy that estimates pushes from those of single tokens, and may simulate the best."""
+    """A policy that looks up the effects of pushes on single tokens, and may simulate the best."""
 
     def __init__(self, task: "Push", env: "PushEnv", tried: int = 0, knows: str = "middle") -> None:
         """Simulate random pushes of each shape.

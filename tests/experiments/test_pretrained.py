@@ -193,7 +193,7 @@ def test_weights_that_are_too_large_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "Square", "../x", "a/b", "small-triangle"])
 def test_a_name_that_cannot_be_one_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ConfigError, match="name must be small letters"):
+    with pytest.raises(ConfigError, match="name must be a-z, 0-9"):
         publish([tmp_path], name, tmp_path / "out")
 
 

@@ -223,7 +223,7 @@ def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
     for wrong, reason in (
         ("turns=2", "without turns"),
         ("task.count=2", "needs all seven"),
-        ("task.puzzle=[dog]", "leave one of both out"),
+        ("task.puzzle=[dog]", "leave one of them out"),
     ):
         status, _, err = here("tangram-play", *told, wrong, cwd=tmp_path)
         assert (status, reason in err) == (2, True), err

@@ -121,7 +121,7 @@ def ways(tokens: Tokens, left: Tensor) -> Tensor:
 
 
 def edge(points: Tensor) -> Tensor:
-    """Distances (..., 1) of points (..., 2) from the table's edge, scaled to [-1, 1]."""
+    """Distances (..., 1) of points (..., 2) from the table's edge: -1 at it, 1 from `_EDGE` on."""
     room = ARENA / 2.0 - points.abs().amax(-1, keepdim=True)
     return (room.clamp(0.0, _EDGE) / _EDGE - 0.5) * 2.0
 

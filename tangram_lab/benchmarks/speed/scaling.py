@@ -84,7 +84,7 @@ class Run:
         return master.memory_info().rss / 2**20, float(master.num_fds())
 
     def rates(self, *names: str) -> dict[str, float]:
-        """Growth of some numbers per second, and CPU seconds per second as "cpu"."""
+        """Growth per second of these numbers of the status, and of CPU seconds as "cpu"."""
         with self.awake():
             # Workers that were stopped for long must join again first.
             episodes = self.numbers()["episodes"]

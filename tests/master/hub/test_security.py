@@ -168,8 +168,8 @@ def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
     public = content["keys"]["evaluator"]["public"]
     assert run_keys(file).given == {"alice": Given("evaluator", public)}
     for settings, reason in (
-        ({"add": "alice"}, "alice has a key already: revoke that key first, or choose another"),
-        ({"add": "player"}, "player has a key already: revoke"),
+        ({"add": "alice"}, "alice has a key already: choose another name, or revoke it"),
+        ({"add": "player"}, "player has a key already: choose another"),
         ({"add": "a/b"}, "add must be a name of at most 64 letters, .* got 'a/b': set add=alice"),
         ({"add": "bob", "out": str(out)}, "alice.json exists already: name another file"),
         ({"revoke": "bob"}, r"revoke must name a key made by tangram-keys \(alice\), got 'bob'"),
