@@ -2,7 +2,7 @@
 
 A score is a number with three or more decimals, or a percentage with at least one. A section is
 the text under one heading. A section that links no file of results is checked against all files
-that the page links. Numbers in code are no scores.
+that the page links, a table's row with links against these alone. Numbers in code are no scores.
 """
 
 import json
@@ -25,6 +25,7 @@ SPREAD = re.compile(rf"({NUMBER})\s+\(({NUMBER})\s+to\s+({NUMBER})\)")
 RANGE = re.compile(rf"({NUMBER})\s+to\s+({NUMBER})")
 LINK = re.compile(r"\]\((?P<file>[^)#\s]+\.(?:csv|md|json))(?:#[^)]*)?\)")
 CODE = re.compile(r"^```.*?^```[ \t]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
+ROW = re.compile(r"^\|.*$", re.MULTILINE)
 HEADING = re.compile(r"^#+ .*$", re.MULTILINE)
 EVERYWHERE = "published.csv"  # scores that the paper and others report, valid in every section
 SCORED = (*("mean_reward", "mean_reward_dense", "coverage", "solved", "filled"),)
@@ -65,18 +66,28 @@ def check_page(results: Path, page: Path) -> Iterator[str]:
     sections = [text[one:other] for one, other in pairwise(starts)]
     every = list(dict.fromkeys(_linked(results, page, text)))
     for section in sections:
-        scores = dict.fromkeys(_scores(section))
-        if not scores:
-            continue
-        files = list(dict.fromkeys(_linked(results, page, section))) or every
-        if not files:
-            yield f"{section.splitlines()[0]}: it has scores but links no file of results"
-            continue
-        known = _together((*files, results / EVERYWHERE))
-        for score in scores:
-            if not _stands(score, known):
-                names = ", ".join(one.name for one in files)
-                yield f"{section.splitlines()[0]}: {_told(score)} is not in {names}"
+        for part, linked in _parts(results, page, section):
+            scores = dict.fromkeys(_scores(part))
+            if not scores:
+                continue
+            heading, files = section.splitlines()[0], linked or every
+            if not files:
+                yield f"{heading}: it has scores but links no file of results"
+                continue
+            known = _together((*files, results / EVERYWHERE))
+            for score in scores:
+                if not _stands(score, known):
+                    names = ", ".join(one.name for one in files)
+                    yield f"{heading}: {_told(score)} is not in {names}"
+
+
+def _parts(results: Path, page: Path, section: str) -> Iterator[tuple[str, list[Path]]]:
+    """Each row of a section's tables that links files, and all else, with the files they link."""
+    rows = {row: list(dict.fromkeys(_linked(results, page, row))) for row in ROW.findall(section)}
+    own = {row: files for row, files in rows.items() if files}
+    yield from own.items()
+    rest = ROW.sub(lambda found: "" if found[0] in own else found[0], section)
+    yield rest, list(dict.fromkeys(_linked(results, page, section)))
 
 
 def _scores(section: str) -> Iterator[tuple[str, ...]]:

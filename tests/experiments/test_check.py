@@ -86,6 +86,12 @@ def test_another_cell_in_a_csv_is_told(cell: str, other: str, page: Path) -> Non
     assert len(told(page)) == 1
 
 
+def test_a_row_with_links_is_checked_against_these_alone(page: Path) -> None:
+    row = "| [speeds](results/bench.json) | 0.123 | 0.500 |"
+    page.write_text(PAGE.replace("## Scores", f"{row}\n\n## Scores"))
+    assert told(page) == ["page.md: # Page: 0.500 is not in bench.json"]
+
+
 def test_what_the_paper_reports_may_stand_everywhere(page: Path) -> None:
     page.write_text(PAGE + "The paper has 0.758, a rival 0.906.\n")
     (line,) = told(page)
