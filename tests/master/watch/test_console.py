@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from master.watch.console import (
     status_line,
     status_panel,
 )
+from tangram_core.errors import ConfigError
 from tangram_core.run.outcome import duration
 from tangram_core.scores import SHOWN, Score, written
 from tangram_core.wire.messages import OPEN, WORKER_COLUMNS, RunStatus
@@ -70,6 +72,16 @@ def test_durations(seconds: float, shown: str) -> None:
 )
 def test_a_share_below_one_is_not_shown_as_one(value: float, shown: str) -> None:
     assert Score("coverage", "coverage").shown(value) == shown
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("score", "got"),
+    [(("x" * 41,), "41, 0 and 3"), (("x", 3, "m" * 9), "1, 9 and 3"), (("x", -1), "1, 0 and -1")],
+)
+def test_a_score_that_does_not_fit_is_refused(score: tuple[Any, ...], got: str) -> None:
+    with pytest.raises(ConfigError, match=f"digits be 0 to 9, got {got}: correct"):
+        Score("speed", *score)
 
 
 @pytest.mark.fast
