@@ -72,6 +72,7 @@ evidence: .venv/.installed-dev  ## what README and docs show of trainings and do
 	@$(call study,parts,laptop)
 	@$(call study,game,laptop)
 	@$(call study,pictures,laptop)
+	@$(call study,hand,laptop)
 	@$(BIN)/tangram-report runs=docs/results
 	@$(BIN)/tangram-report check
 
