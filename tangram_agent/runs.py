@@ -165,11 +165,6 @@ class Run:
                 )
         return shown
 
-    def unlearned(self) -> "Run":
-        """A copy of the run with all weights 0, so that its networks have no preferences."""
-        none = {name: np.zeros_like(one) for name, one in self.weights.tensors.items()}
-        return replace(self, weights=replace(self.weights, tensors=none))
-
     def with_settings(self, changes: Changes) -> "Run":
         """A copy of the run that plays with other settings, such as `{"agent": {"reapply": 1}}`.
 

@@ -12,7 +12,6 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from tangram_agent.agents.outline.agent import Outline
 from tangram_agent.runs import Run, load_changed
 from tangram_core.agent import AT_ONCE
 from tangram_core.errors import ConfigError
@@ -71,21 +70,13 @@ def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
     Raises:
         ConfigError: a rival is unknown.
     """
-    others = _rivals(run)
+    others = dict(run.setup.task.rivals())
     if tuple(rivals) != ALL:
         for name in rivals:
             if name not in others:
                 raise ConfigError(f"rivals: no '{name}' here, choose from {', '.join(others)}")
         others = {name: others[name] for name in rivals}
     return {RUN: by(run.actor)} | others
-
-
-def _rivals(run: Run) -> dict[str, Player]:
-    others, agent = dict[str, Player](), run.setup.agent
-    if isinstance(agent, Outline):
-        # With weights of 0 all places are worth the same; the first is the largest token's.
-        others["largest first"] = by(run.unlearned().actor)
-    return others | dict(run.setup.task.rivals())
 
 
 def score_policies(

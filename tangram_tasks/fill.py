@@ -55,8 +55,13 @@ class Fill(Place):
         return {name: every[name] for name in _AREAS}
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """Random play alone: the formula would need the hidden pieces."""
-        return {"random": super().rivals()["random"]}
+        """A search, and random play; the formula would need the hidden pieces."""
+        from tangram_tasks.rivals.search import search_policy  # noqa: PLC0415
+
+        found: dict[str, Callable[[Env], Chooser]] = {
+            "search": lambda _: search_policy(self.layout, self.sim)
+        }
+        return found | {"random": super().rivals()["random"]}
 
     def __post_init__(self) -> None:
         """Refuse settings that do not move each token exactly once, from outside.

@@ -120,7 +120,7 @@ def test_an_agent_of_outlines_ships_beside_its_rivals(
     write_run(run, tokens=seven, sim=OUTLINES | sim | {"targets": "touching"}, agent=FILLER)
     folder = publish([run], "outlines", tmp_path / "out", 1)
     card = json.loads((folder / "card.json").read_text())
-    assert set(card["tests"]["scores"]) == {"this run", "largest first", "random"}
+    assert set(card["tests"]["scores"]) == {"this run", "search", "random"}
     told = {*card["tests"]["scores"]["this run"], *card["puzzles"]["test"]["scores"]}
     assert {"iou", "solved", "coverage_p10"} <= told
 

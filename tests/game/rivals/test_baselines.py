@@ -7,11 +7,15 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from shapely import box
 
 from tangram_core.task import Chooser, History
+from tangram_sim.geometry.rings import as_rows
 from tangram_sim.motion.kinematics import wrap
 from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
+from tangram_tasks.rivals.search import search_policy
+from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
 from worker.score.test_set import FixedTests
@@ -105,3 +109,15 @@ def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(
     assert 0.9 < np.abs(centres).max() <= 1.0 + 1e-6
     turned = made.layout.flipped(played.ends) != made.layout.flipped(played.starts)
     assert turned.any() == allow_flip
+
+
+def test_the_search_fills_outlines_and_leaves_what_has_no_place() -> None:
+    made = outline_setup(GAME).task
+    with closing(FixedTests(made, 3, 3)) as tests:
+        scores = made.score(tests.play(search_policy(made.layout, made.sim)))
+    assert (scores["solved"], scores["blocked"], scores["refused"]) == (1.0, 0.0, 0.0)
+    thin = box(0.0, 0.0, made.layout.areas.sum() / 0.05, 0.05)  # no token fits
+    strip = as_rows(thin, made.layout, made.goal_rows)
+    corners, placed = made.layout.corners(np.zeros((1, 7, 3))), np.zeros((1, 7), bool)
+    action = chosen(search_policy(made.layout, made.sim), corners, placed, strip[None])
+    np.testing.assert_array_equal(action[0, -4:], [-1.0, 0.0, 0.0, 0.0])
