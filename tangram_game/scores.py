@@ -53,7 +53,7 @@ def score_puzzles(
     run, titles = played[RUN], [figure.title for figure in figures]
     told = "positions in arena units"
     if task.outlines:
-        told = "played by the run itself; any dissection counts, so no errors of position and angle"
+        told = "any dissection counts, so no errors of position and angle"
     return Scored(scores, _one_by_one(task, figures, run), titles, run.ends, run.goals, told)
 
 

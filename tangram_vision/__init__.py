@@ -1,4 +1,4 @@
-"""Find tokens in pictures, and fill silhouettes with tokens. Only workers use it; needs OpenCV.
+"""Find tokens in pictures, which needs OpenCV, and fill silhouettes. No master imports it.
 
 Start with `solving.py`, `pictures/seeing.py` and `silhouettes/silhouettes.py`. Folders: given,
 silhouettes, pictures; each imports only those named after it. May import tangram_sim and

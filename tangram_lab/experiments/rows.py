@@ -118,7 +118,7 @@ def rows_of(
     points = list(curve)
     tests = scores.get("episodes") or len(scores.get("puzzles", ())) * (scores.get("turns") or 1)
     same = {"training": training, "label": label, "seed": seed, "test": test}
-    same |= {"commit": (result.get("commit") or "")[:7], "tests": tests}
+    same |= {"commit": _short(result.get("commit") or ""), "tests": tests}
     agent = same | {"policy": AGENT} | {name: scores.get(key) for name, key in SCORES.items()}
     agent |= {"seconds_per_puzzle": scores.get("seconds_per_puzzle")}
     agent |= {name: result.get(name) for name in RUN} | {"train_seconds": result.get("train_s")}
@@ -128,6 +128,11 @@ def rows_of(
         for name, row in scores.get("baselines", {}).items()
     ]
     return [agent, *rivals]
+
+
+def _short(commit: str) -> str:
+    """Seven digits of a commit, and "-dirty" if files differed from it."""
+    return commit[:7] + commit[40:]
 
 
 def _reached(curve: list[Row], level: float) -> str:

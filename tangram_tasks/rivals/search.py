@@ -16,13 +16,14 @@ from tangram_sim.motion.actions import make_actions, velocities_of
 from tangram_tasks.played import as_seen
 from tangram_vision.silhouettes.silhouettes import fill_outline
 
-SECONDS = 5.0  # processor time for each outline, at most
+SECONDS = 5.0  # processor time for each outline, about
 
 
 def search_policy(layout: Layout, sim: SimConfig) -> Chooser:
     """Search for a dissection of each outline, then lay its tokens one by one.
 
-    If the time runs out, its best attempt is laid. Tokens without a place stay where they are.
+    If it finds none, its best attempt is laid. Tokens without a place stay where they are. A slower
+    machine may find less, as the search has a time limit.
     """
     known: dict[bytes, Dissection | None] = {}
 
@@ -33,7 +34,9 @@ def search_policy(layout: Layout, sim: SimConfig) -> Chooser:
             known[key] = filled.found or filled.attempt
         return known[key]
 
-    def choose(seen: Arrays, _past: History, _generators: Generators) -> Singles:
+    def choose(seen: Arrays, past: History, _generators: Generators) -> Singles:
+        if not past.actions.shape[1]:  # new episodes
+            known.clear()
         corners, placed, goals = as_seen(seen)
         count = len(corners)
         token = np.zeros(count, np.int64)

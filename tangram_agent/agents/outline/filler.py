@@ -1,6 +1,6 @@
 """Choice of the next token and its place, after which the rest is most likely to be filled.
 
-If no token fits any more, the others stay where they are.
+If no place leaves a rest that may be filled, the tokens left stay where they are.
 
 Legend: B environments, K tokens, V corners, G rows of an outline.
 """

@@ -7,14 +7,15 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from shapely import box
+from shapely import Polygon
 
 from tangram_core.task import Chooser, History
-from tangram_sim.geometry.rings import as_rows
+from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.motion.kinematics import wrap
 from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tangram_tasks.rivals.search import search_policy
+from tangram_vision.silhouettes.silhouettes import Filled
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
@@ -111,13 +112,39 @@ def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(
     assert turned.any() == allow_flip
 
 
-def test_the_search_fills_outlines_and_leaves_what_has_no_place() -> None:
+def test_the_search_fills_outlines() -> None:
     made = outline_setup(GAME).task
     with closing(FixedTests(made, 3, 3)) as tests:
         scores = made.score(tests.play(search_policy(made.layout, made.sim)))
     assert (scores["solved"], scores["blocked"], scores["refused"]) == (1.0, 0.0, 0.0)
-    thin = box(0.0, 0.0, made.layout.areas.sum() / 0.05, 0.05)  # no token fits
-    strip = as_rows(thin, made.layout, made.goal_rows)
-    corners, placed = made.layout.corners(np.zeros((1, 7, 3))), np.zeros((1, 7), bool)
-    action = chosen(search_policy(made.layout, made.sim), corners, placed, strip[None])
-    np.testing.assert_array_equal(action[0, -4:], [-1.0, 0.0, 0.0, 0.0])
+
+
+def test_the_search_lays_what_has_a_place_and_looks_once_in_an_episode(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, asked = outline_setup(GAME).task, []
+    lies, poses = np.zeros(7, bool), np.zeros((7, 3))
+    lies[[2, 4]], poses[4] = True, (0.1, 0.2, 0.3)
+    attempt = Dissection(poses, np.zeros(7, bool), lies)
+
+    def fill(area: Polygon, *_: object) -> Filled:
+        asked.append(area)
+        return Filled(None, 0.5, 0.0, 1, complete=True, attempt=attempt)
+
+    monkeypatch.setattr("tangram_tasks.rivals.search.fill_outline", fill)
+    policy, goals = search_policy(made.layout, made.sim), np.zeros((1, made.goal_rows, 2))
+    corners, later = made.layout.corners(np.zeros((1, 7, 3))), History({}, np.zeros((1, 1, 5)))
+    placed = np.zeros((1, 7), bool)
+    placed[0, :3] = True
+    seen = {"corners": corners, "placed": placed, "goals": goals}
+    action = policy(seen, NOTHING, [])[0]
+    token = np.arange(7)[lies & ~placed[0]]
+    assert int((action[0] + 1.0) / 2.0 * 7) == token
+    np.testing.assert_allclose(action[-3:], [0.1 / 2.0, 0.2 / 2.0, 0.3 / np.pi], atol=1e-6)
+    placed[0, 4] = True  # what has no place stays
+    stuck = policy(seen, later, [])[0]
+    assert int((stuck[0] + 1.0) / 2.0 * 7) == 3
+    np.testing.assert_array_equal(stuck[-4:], [-1.0, 0.0, 0.0, 0.0])
+    assert len(asked) == 1
+    policy(seen, NOTHING, [])
+    assert len(asked) == 2

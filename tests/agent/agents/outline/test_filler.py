@@ -92,6 +92,8 @@ def test_where_nothing_fits_tokens_stay() -> None:
     step = filler.choose(corners, placed, rows, np.zeros(1, np.bool_))
     assert step.token.tolist() == [0]
     assert (step.velocity == 0).all()
+    one = [np.random.default_rng(0)]  # exploring, too
+    assert (filler.choose(corners, placed, rows, np.ones(1, np.bool_), one).velocity == 0).all()
 
 
 def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
