@@ -47,7 +47,7 @@ studies:
       dots: {kind: seeds, title: Seeds, test: as_trained, trainings: [one, two]}
       line: {kind: tests, title: Tests, trainings: [one], tests: [as_trained, puzzles]}
 """
-RESULT = {"commit": "0123456789ab", "updates": 20, "episodes": 64, "parameters": 9, "train_s": 1.5}
+RESULT = {"commit": "0123456789" * 4 + "-dirty", "updates": 20, "episodes": 64, "parameters": 9, "train_s": 1.5}
 SCORES = {
     "episodes": 16,
     "mean_reward": 0.123456789,
@@ -189,7 +189,7 @@ def test_a_test_leaves_a_row_of_the_agent_and_one_of_each_rival() -> None:
         "seed": 0,
         "test": "as_trained",
         "policy": "agent",
-        "commit": "0123456",
+        "commit": "0123456-dirty",
         "tests": 16,
         "mean_reward": 0.123456789,
         "angle_error_deg": 2.0,
