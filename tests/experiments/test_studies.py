@@ -47,7 +47,13 @@ studies:
       dots: {kind: seeds, title: Seeds, test: as_trained, trainings: [one, two]}
       line: {kind: tests, title: Tests, trainings: [one], tests: [as_trained, puzzles]}
 """
-RESULT = {"commit": "0123456789" * 4 + "-dirty", "updates": 20, "episodes": 64, "parameters": 9, "train_s": 1.5}
+RESULT = {
+    "commit": "0123456789" * 4 + "-dirty",
+    "updates": 20,
+    "episodes": 64,
+    "parameters": 9,
+    "train_s": 1.5,
+}
 SCORES = {
     "episodes": 16,
     "mean_reward": 0.123456789,
