@@ -54,7 +54,7 @@ def test_the_page_of_tensorboard_has_every_tag_of_a_run_and_a_run_every_tag_of_t
 ) -> None:
     """Without those that the page says are not always there."""
     text = (ROOT / "docs" / "tensorboard.md").read_text()
-    sometimes = text.partition("**Messages, where it happens.**")[2]
+    sometimes = text.partition("**Events.**")[2]
     rows = [row for row in text.splitlines() if row.startswith("| `")]
     explained = {tag: row for row in rows for tag in re.findall(r"`([\w/]+)`", row.split("|")[1])}
     folder = trained / "tensorboard"
