@@ -1,6 +1,6 @@
 """Choice of the next token and its place, after which the rest is most likely to be filled.
 
-If no place leaves a rest that may be filled, the tokens left stay where they are.
+If no place leaves a rest that may be filled, a token left goes to where it covers most of it.
 
 Legend: B environments, K tokens, V corners, G rows of an outline.
 """
@@ -8,7 +8,9 @@ Legend: B environments, K tokens, V corners, G rows of an outline.
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 import torch
+from shapely import Polygon
 from torch import nn
 
 from tangram_agent.agents.outline.filling import Filling, Rests
@@ -16,9 +18,16 @@ from tangram_agent.agents.outline.values import Corners
 from tangram_agent.base.types import Choice
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
+from tangram_sim.config import MAX_OVERLAP
+from tangram_sim.geometry.areas import Area, polygons
 from tangram_sim.geometry.dissections import Laid, Place
+from tangram_sim.geometry.overlap import outlines
+from tangram_sim.geometry.rings import covered_area
 from tangram_sim.motion.actions import velocities_of
 from tangram_tasks.fill import Fill
+
+_ANGLES = 8  # tried for each token if none fits
+_FREE = 0.5  # share of MAX_OVERLAP that such a token may use
 
 
 class Filler:
@@ -67,6 +76,8 @@ class Filler:
         sides = self._layout.flipped(corners)
         for b, place in enumerate(best):
             laid = place.laid if place else None
+            if laid is None and not len(generators):  # exploration does not need it
+                laid = self._rough(rests[b], corners[b], placed[b])
             token[b], wanted[b] = self._taken(laid, here[b], sides[b], placed[b])
             flip[b] = laid is not None and bool(sides[b, token[b]] != laid.flipped)
         way = wanted - here[np.arange(count), token]
@@ -112,3 +123,27 @@ class Filler:
             return bool(sides[token] != laid.flipped), float(np.hypot(*way[:2]))
 
         return min(alike, key=far), laid.pose
+
+    def _rough(self, rest: Area, corners: Floats, placed: Bools) -> Laid | None:
+        """Where a token that is left covers most of the rest; None if it would cover others."""
+        sides, tried, laid = self._layout.flipped(corners), [], []
+        for token in np.flatnonzero(~placed).tolist():
+            for part in polygons(rest):
+                for angle in np.arange(_ANGLES) * (2.0 * np.pi / _ANGLES):
+                    pose = np.array([part.centroid.x, part.centroid.y, angle])
+                    laid.append(Laid(int(self._filling.shape_of[token]), bool(sides[token]), pose))
+                    tried.append((token, pose))
+        if not tried:
+            return None
+        poses = self._layout.poses(np.repeat(corners[None], len(tried), axis=0))
+        for row, (token, pose) in zip(poses, tried, strict=True):
+            row[token] = pose
+        own = outlines(self._layout.corners(poses, np.tile(sides, (len(tried), 1))), self._layout)
+        tokens = np.array([token for token, _ in tried])
+        bodies = shapely.polygons(own[np.arange(len(tried)), tokens])
+        covered = shapely.area(shapely.intersection(bodies, rest))
+        others = covered_area(corners, self._layout, placed) if placed.any() else Polygon()
+        over = shapely.area(shapely.intersection(bodies, others))
+        covered[over > _FREE * MAX_OVERLAP * self._layout.areas[tokens]] = 0.0
+        best = int(covered.argmax())
+        return laid[best] if covered[best] > 0.0 else None

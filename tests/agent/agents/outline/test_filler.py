@@ -78,7 +78,7 @@ def test_values_decide_between_places() -> None:
         assert went == pytest.approx(wanted.laid.pose[:2], abs=1e-5)
 
 
-def test_where_nothing_fits_tokens_stay() -> None:
+def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
     """A strip of the area of two triangles has no corner for them."""
     made = outline_setup()
     filling, layout = Filling(made.task.layout), made.task.layout
@@ -90,10 +90,12 @@ def test_where_nothing_fits_tokens_stay() -> None:
     filler = Filler(Indifferent(), made.task)
     assert filling.places(filling.rest(rows[0], corners[0], placed[0]), (2,)) == []
     step = filler.choose(corners, placed, rows, np.zeros(1, np.bool_))
-    assert step.token.tolist() == [0]
-    assert (step.velocity == 0).all()
-    one = [np.random.default_rng(0)]  # exploring, too
-    assert (filler.choose(corners, placed, rows, np.ones(1, np.bool_), one).velocity == 0).all()
+    went = layout.poses(corners)[0, step.token[0], :2] + step.velocity[0, :2] * made.task.sim.arena
+    assert went == pytest.approx([leg, leg / 4], abs=1e-5)  # the strip's middle
+    # Exploring nothing is learned from where it lies, and it stays.
+    one = [np.random.default_rng(0)]
+    for anything in (np.zeros(1, np.bool_), np.ones(1, np.bool_)):
+        assert (filler.choose(corners, placed, rows, anything, one).velocity == 0).all()
 
 
 def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
