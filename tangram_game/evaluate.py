@@ -68,9 +68,11 @@ def policies(run: Run, rivals: Sequence[str] = ALL) -> dict[str, Player]:
     """The run and its rivals, by their names in tables and files.
 
     Raises:
-        ConfigError: a rival is unknown.
+        ConfigError: a rival is unknown, or has the name of the run's own scores.
     """
     others = dict(run.setup.task.rivals())
+    if RUN in others:
+        raise ConfigError(f"the task calls a rival '{RUN}', as the agent's own column: rename it")
     if tuple(rivals) != ALL:
         for name in rivals:
             if name not in others:

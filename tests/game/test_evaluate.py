@@ -17,7 +17,7 @@ from tangram_game.evaluate import evaluate_run, score_policies, scores_table
 from tangram_game.play import play_run
 from tangram_game.scores import RUN
 from tangram_sim.geometry.layout import TokensConfig
-from tangram_tasks.place import ONE_TOKEN
+from tangram_tasks.place import ONE_TOKEN, Place
 from tangram_tasks.push.task import Push, PushConfig
 from tests.agent.builders import PAIR, SQUARE
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
@@ -88,6 +88,14 @@ def test_only_the_rivals_that_are_asked_for_are_scored(tmp_path: Path) -> None:
     assert evaluated(tmp_path, SQUARE, episodes=2, rivals=())["baselines"] == {}
     with pytest.raises(ConfigError, match="no 'exakt' here, choose from exact, position only"):
         evaluated(tmp_path, SQUARE, episodes=2, rivals=("exakt",))
+
+
+def test_no_rival_takes_the_place_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Place, "rivals", lambda task: {RUN: lambda env: None})
+    with pytest.raises(ConfigError, match="calls a rival 'this run'.*rename it"):
+        evaluated(tmp_path, SQUARE, episodes=2)
 
 
 def test_evaluation_repeats_itself_and_other_tests_differ(tmp_path: Path) -> None:
