@@ -98,14 +98,20 @@ def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
         assert (filler.choose(corners, placed, rows, anything, one).velocity == 0).all()
 
 
-def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
+@pytest.mark.parametrize("larger", [1.0, 1.2])
+def test_who_has_a_token_left_lets_it_lie_where_it_would_lie_on_another(larger: float) -> None:
+    """A placed triangle covers an outline, or all of it but a rim."""
     made = outline_setup()
     corners = made.task.layout.corners(np.array([[0.3, 0.2, 0.0], [-0.9, 0.9, 0.0]]))[None]
     first = corners[0, made.task.layout.corners_of(0)]
-    target = np.concatenate([first, first[:1]])
+    middle = first.mean(axis=0)
+    target = middle + larger * (np.concatenate([first, first[:1]]) - middle)
     rows = np.concatenate([target, np.zeros((made.task.goal_rows - len(target), 2))])[None]
     placed = np.array([[True, False]])
-    assert Filling(made.task.layout).rest(rows[0], corners[0], placed[0]).is_empty
+    filling = Filling(made.task.layout)
+    rest = filling.rest(rows[0], corners[0], placed[0])
+    assert rest.is_empty == (larger == 1.0)
+    assert filling.places(rest, (2,)) == []
     step = Filler(Indifferent(), made.task).choose(corners, placed, rows, np.zeros(1, np.bool_))
     assert step.token.tolist() == [1]
     assert (step.velocity == 0).all()
