@@ -82,9 +82,8 @@ def goal_updates(setup: Setup, *, compiled: bool = False) -> Work:
         made.update(0.0, rng)
         return 1
 
-    for _ in range(goal_config(setup).actor_delay):  # compile both forms, with and without actor
+    for _ in range(goal_config(setup).actor_delay):  # compile both forms
         work()
-
     return work
 
 
@@ -180,4 +179,6 @@ def updates(setup: Setup, made: Ddpg | None = None) -> Work:
         own.learn(steps())
         return 1
 
+    for _ in range(own.delay):  # compile both forms, with and without actor
+        work()
     return work
