@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from shutil import which
@@ -151,15 +152,18 @@ def versions() -> dict[str, str]:
 
 
 def commit(root: Path = ROOT) -> str | None:
-    """Git commit of the source tree, `-dirty` if it was changed; None outside a git tree."""
+    """Git commit of a source tree, `-dirty` if not only results were changed; None without git."""
     if not (root / ".git").exists():
         return None
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"]
+    head, changed = ["rev-parse", "HEAD"], ["diff", "--name-only", "HEAD", "--", ":!docs/results"]
+    ask = partial(subprocess.run, capture_output=True, text=True, timeout=10, check=False)
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+        found, more = (
+            ask(["git", "-C", str(root), *one]).stdout.strip() for one in (head, changed)
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return done.stdout.strip() or None
+    return found + "-dirty" * bool(more) if found else None
 
 
 def processor() -> str:

@@ -1,6 +1,7 @@
 """What a run has come to: the final table, and commands that can be pasted."""
 
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from master.record.rundir import RunFolder
-from master.watch.result import go_on_command, show_result
+from master.watch.result import commit, go_on_command, show_result
 from tangram_core.scores import written
 from tangram_tasks.place import ONE_TOKEN
 from tests.master.builders import screen, text
@@ -103,3 +104,24 @@ def test_commands_that_are_shown_can_be_pasted(
         assert (commands / command).exists()
     (parsed,) = OverridesParser.create().parse_overrides([play[-2]])
     assert parsed.value() == str(folder.path)
+
+
+def test_results_that_an_experiment_writes_do_not_make_a_commit_dirty_and_code_does(
+    tmp_path: Path,
+) -> None:
+    def git(*words: str) -> str:
+        said = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *words]
+        return subprocess.run(said, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert commit(tmp_path) is None
+    (tmp_path / "docs" / "results").mkdir(parents=True)
+    code, row = tmp_path / "code.py", tmp_path / "docs" / "results" / "rows.csv"
+    for file in (code, row):
+        file.write_text("1")
+    for words in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "first"]):
+        git(*words)
+    head = git("rev-parse", "HEAD")
+    row.write_text("2")
+    assert commit(tmp_path) == head
+    code.write_text("2")
+    assert commit(tmp_path) == f"{head}-dirty"
