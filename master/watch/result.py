@@ -7,7 +7,6 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from shutil import which
@@ -155,15 +154,16 @@ def commit(root: Path = ROOT) -> str | None:
     """Git commit of a source tree, `-dirty` if not only results were changed; None without git."""
     if not (root / ".git").exists():
         return None
-    head, changed = ["rev-parse", "HEAD"], ["diff", "--name-only", "HEAD", "--", ":!docs/results"]
-    ask = partial(subprocess.run, capture_output=True, text=True, timeout=10, check=False)
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(root), *words]
+        return subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL, timeout=10)
+
     try:
-        found, more = (
-            ask(["git", "-C", str(root), *one]).stdout.strip() for one in (head, changed)
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        changed = git("diff", "--name-only", "HEAD", "--", ":!docs/results")
+        return git("rev-parse", "HEAD").strip() + "-dirty" * bool(changed)
+    except (OSError, subprocess.SubprocessError):
         return None
-    return found + "-dirty" * bool(more) if found else None
 
 
 def processor() -> str:

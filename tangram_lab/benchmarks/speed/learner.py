@@ -82,8 +82,7 @@ def goal_updates(setup: Setup, *, compiled: bool = False) -> Work:
         made.update(0.0, rng)
         return 1
 
-    for _ in range(goal_config(setup).actor_delay):  # compile both forms
-        work()
+    made.prepare()
     return work
 
 
@@ -179,6 +178,5 @@ def updates(setup: Setup, made: Ddpg | None = None) -> Work:
         own.learn(steps())
         return 1
 
-    for _ in range(own.delay):  # compile both forms, with and without actor
-        work()
+    own.prepare()
     return work

@@ -125,3 +125,5 @@ def test_results_that_an_experiment_writes_do_not_make_a_commit_dirty_and_code_d
     assert commit(tmp_path) == head
     code.write_text("2")
     assert commit(tmp_path) == f"{head}-dirty"
+    (tmp_path / ".git" / "index").write_text("damaged")
+    assert commit(tmp_path) is None
