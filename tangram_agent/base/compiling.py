@@ -117,6 +117,7 @@ class Whole:
     def _built(self, function: Call, tensors: list[Tensor], numbers: list[Tensor]) -> Call:
         """The function, compiled."""
         # Only here: the compiler takes seconds and 200 MB to load.
+        from torch._decomp import get_decompositions  # noqa: PLC0415
         from torch._inductor import standalone_compile  # noqa: PLC0415
         from torch.fx.experimental.proxy_tensor import make_fx  # noqa: PLC0415
 
@@ -125,8 +126,10 @@ class Whole:
         def flat(*given: Tensor) -> tuple[Tensor]:
             return (function(given[:count], given[count:]),)
 
+        # A bias is added by the code that reads the product, not copied to its place before.
+        apart = get_decompositions([torch.ops.aten.addmm])
         with self.unchanged():  # tracing executes the function
-            graph, constants = _lifted(make_fx(flat)(*tensors, *numbers))
+            graph, constants = _lifted(make_fx(flat, apart)(*tensors, *numbers))
         example: list[Any] = [*constants, *tensors, *numbers]
         patches = {
             # On a CPU the code that calls the compiled pieces is C++ as well.
