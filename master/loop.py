@@ -10,7 +10,7 @@ from master.hub.hub import Hub
 from master.learn.budget import Budget
 from master.learn.divergence import DivergenceGuard
 from master.learn.lockstep import Lockstep
-from master.record.delivery import EpisodesArrived, ScoresArrived
+from master.record.delivery import EpisodesArrived
 from master.record.rundir import Clock, FolderError, RunFolder
 from master.signals import StopSignals, stop_notice
 from master.watch.report import Reporter
@@ -87,10 +87,10 @@ class Loop:
         """Receive batches and scores, and answer the peers; wait at most `patience_s`."""
         self.watchdog.progress()
         for arrival in self.hub.poll(patience_s):
-            if isinstance(arrival, ScoresArrived):
-                self.reporter.scored(arrival.scores)
-            else:
+            if isinstance(arrival, EpisodesArrived):
                 self._arrived.put(arrival.owner, arrival)
+            else:
+                self.reporter.scored(arrival)
         record = self.clock.record
         record.workers = max(record.workers, self.hub.count("player"))
 

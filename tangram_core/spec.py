@@ -4,7 +4,7 @@ Legend: E episodes, B environments that play in step, T steps of an episode, A e
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -164,9 +164,3 @@ class Episodes:
     def at(self, rows: Any) -> "Episodes":
         """The selected episodes; `rows`: an index array, a slice or a mask."""
         return Episodes({name: array[rows] for name, array in self.arrays.items()})
-
-
-def joined(parts: Iterable[Episodes]) -> Episodes:
-    """Concatenate episodes of equal length."""
-    every = list(parts)
-    return Episodes({n: np.concatenate([one[n] for one in every]) for n in every[0].arrays})

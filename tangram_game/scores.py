@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from tangram_core.arrays import Floats
 from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_tasks.metrics import Assembled, assembled, pose_errors, summarise
 from tangram_tasks.place import Place
@@ -30,17 +29,11 @@ class Scored:
     Attributes:
         means: mean scores over all puzzles, by the policies' names.
         puzzles: scores of the run on each puzzle.
-        titles: titles of the puzzles.
-        ends: (E, V, 2) corners of the tokens as the run left them.
-        goals: (E, V, 2) corners of the puzzles' pieces.
         told: remark on the scores, for a caption.
     """
 
     means: dict[str, Scores]
     puzzles: list[dict[str, Any]]
-    titles: list[str]
-    ends: Floats
-    goals: Floats
     told: str
 
 
@@ -50,11 +43,10 @@ def score_puzzles(
     """Score each policy on the same puzzles and starts."""
     played = {name: play_figures(task, figures, player, seed) for name, player in players.items()}
     scores = {name: _of_puzzles(task, own) for name, own in played.items()}
-    run, titles = played[RUN], [figure.title for figure in figures]
     told = "positions in arena units"
     if task.outlines:
         told = "any dissection counts, so no errors of position and angle"
-    return Scored(scores, _one_by_one(task, figures, run), titles, run.ends, run.goals, told)
+    return Scored(scores, _one_by_one(task, figures, played[RUN]), told)
 
 
 def _of_puzzles(task: Place, played: Played) -> Scores:

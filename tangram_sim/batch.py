@@ -153,7 +153,6 @@ class BatchedEnv:
         self.corners: Floats = np.zeros((count, layout.corner_count, 2))
         self.goals: Floats = np.zeros((count, layout.corner_count, 2))
         self.seen, self.seen_goals = self.corners, self.goals
-        self._generators: Sequence[np.random.Generator] = ()
 
     @property
     def placed(self) -> Bools:
@@ -195,7 +194,6 @@ class BatchedEnv:
         if starts is None:
             none = np.zeros((self.count, self.layout.tokens), np.bool_)
             starts = Starts(*sample_starts(self.layout, self.sim, targets, generators), none)
-        self._generators = generators
         self._begin(targets, starts)
         if self.sim.observe == "silhouette":
             self.seen_goals = self._outlined()

@@ -21,7 +21,7 @@ from master.hub.security import Holder, Keys
 from master.hub.sockets import Received, Sockets
 from master.record.audit import Audit
 from master.record.counters import Counters
-from master.record.delivery import Arrival, EpisodesArrived, Exams, ScoresArrived, Verdict, Waiting
+from master.record.delivery import Arrival, EpisodesArrived, Exams, Verdict, Waiting
 from master.record.journal import MARK
 from tangram_core.agent import Weights
 from tangram_core.errors import WireError
@@ -344,7 +344,7 @@ class Hub:
                     self.counters["weights_asked_again"] += 1
         return None
 
-    def _scores(self, peer: Peer, scores: Scores) -> ScoresArrived | None:
+    def _scores(self, peer: Peer, scores: Scores) -> Scores | None:
         """Check scores; another user's evaluator counts only while the run has none of its own."""
         odd = scores.scalars.keys() - self._info.scores - set(COUNTS)
         if odd:
@@ -358,7 +358,7 @@ class Hub:
             self._reject(peer, 0, reason, "excess_scores")
             return None
         self.counters["scores"] += 1
-        return ScoresArrived(peer.index, peer.incarnation, scores)
+        return scores
 
     def _batch(
         self, peer: Peer, batch: EpisodeBatch, frames: Sequence[bytes]

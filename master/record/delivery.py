@@ -60,16 +60,7 @@ class EpisodesArrived:
         return self.batch.episodes
 
 
-@dataclass(frozen=True, eq=False)
-class ScoresArrived:
-    """New scores from an evaluator."""
-
-    index: int
-    incarnation: int
-    scores: Scores
-
-
-Arrival = EpisodesArrived | ScoresArrived
+Arrival = EpisodesArrived | Scores
 
 
 class Verdict(Enum):

@@ -1,7 +1,6 @@
 """The status of a run: collected in one place, and passed at bounded rates to all outputs."""
 
 import json
-import logging
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -36,8 +35,6 @@ PICTURES = 100  # in TensorBoard; see POINTS in `metrics`
 TICK_S = 0.1
 LISTEN_S = 1.0
 LOG_S = 2.0  # between two points of the curves
-
-log = logging.getLogger(__name__)
 
 
 class StatusCollector:

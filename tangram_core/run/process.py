@@ -237,3 +237,23 @@ class Every:
     def rest(self, seconds: float) -> None:
         """Delay the next `due` to at least this many seconds from now."""
         self._next_s = max(self._next_s, time.clock_gettime(time.CLOCK_BOOTTIME) + seconds)
+
+
+@contextmanager
+def quiet(*numbers: int) -> Iterator[None]:
+    """Discard what C code writes to these file numbers (1 stdout, 2 stderr), not to sys.stdout."""
+    try:
+        kept = {number: os.dup(number) for number in numbers}
+    except OSError:  # this process has none
+        yield
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for number in kept:
+            os.dup2(null, number)
+        yield
+    finally:
+        for number, old in kept.items():
+            os.dup2(old, number)
+            os.close(old)
+        os.close(null)

@@ -7,7 +7,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,6 @@ class Row:
     most: float | None = None
     target: str = ""
     held: bool | None = None
-
-    def plain(self) -> dict[str, Any]:
-        """The fields as a dict for JSON."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 
 import torch
 
@@ -39,7 +40,7 @@ def run_stages(given: argparse.Namespace) -> int:
     settings = {name: value for name, value in vars(given).items() if name not in ("out", "rows")}
     if given.kind == "gpu":
         settings["card"] = torch.cuda.get_device_name()
-    write(given.out, {"settings": settings, "rows": [row.plain() for row in rows]})
+    write(given.out, {"settings": settings, "rows": [asdict(row) for row in rows]})
     return 0
 
 

@@ -24,7 +24,6 @@ OLD = {
     "share_solved": "solved",
     "share_solved_iou": "solved",
 }
-KEY = ("training", "seed", "test", "policy")
 # Column -> name in the files of tangram-eval.
 SCORES = {
     "mean_reward": "mean_reward",

@@ -200,7 +200,7 @@ class Search:
         if not self._divides([part.area for part in parts], left):
             return
         for one, polygon in self._fewest(parts, left):
-            yield from self._fill(self._without(rest, polygon), less(left, one), [*laid, one])
+            yield from self._fill(self._without(rest, polygon), less(left, one.shape), [*laid, one])
             if self.budget.spent():
                 return
 
@@ -211,7 +211,7 @@ class Search:
             return []
         places = []
         for one, polygon in self._fewest(parts, left):
-            gone, now = self._without(rest, polygon), less(left, one)
+            gone, now = self._without(rest, polygon), less(left, one.shape)
             open_to = self.fits(gone, now)
             places.append(Place(one, gone, now, filled=open_to and not any(now), dead=not open_to))
         return places
@@ -318,9 +318,9 @@ def convex_corners(
             yield complex(z[i]), along, float(inside[i]), *lengths
 
 
-def less(left: tuple[int, ...], one: Laid) -> tuple[int, ...]:
-    """The number of tokens left of each shape after one more is laid."""
-    return tuple(count - (shape == one.shape) for shape, count in enumerate(left))
+def less(left: tuple[int, ...], laid: int) -> tuple[int, ...]:
+    """The number of tokens left of each shape after one more of the shape `laid` is laid."""
+    return tuple(count - (shape == laid) for shape, count in enumerate(left))
 
 
 def dissection(tokens: Tokens, laid: Sequence[Laid]) -> Dissection:

@@ -1,32 +1,11 @@
 """PyBullet, imported without the line about its build that it prints."""
 
-import os
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from tangram_core.errors import TangramError
+from tangram_core.run.process import quiet
 
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Discard what C code writes to stderr; replacing sys.stderr does not affect C code."""
-    try:
-        kept = os.dup(2)
-    except OSError:  # this process has no stderr
-        yield
-        return
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(null)
-
-
-with _quiet():
+with quiet(2):
     import pybullet
 
 __all__ = ["Client", "pybullet"]

@@ -4,10 +4,8 @@ Legend: n rows, G entries of a goal, A entries of an action.
 """
 
 import importlib
-import os
 import weakref
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 import gymnasium
@@ -17,6 +15,7 @@ from gymnasium import spaces
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.errors import ConfigError
 from tangram_core.run.code import check_module
+from tangram_core.run.process import quiet
 from tangram_core.spec import MAX_REWARD, Array, EpisodeSpec, Field
 from tangram_tasks.gym.task import SUCCESS, GymConfig
 
@@ -70,7 +69,7 @@ class Judge:
             ConfigError: the environment's own code fails, for example for lack of a package.
         """
         try:
-            with _quiet():
+            with quiet(1, 2):
                 return gymnasium.make(
                     self._config.id, max_episode_steps=-1, disable_env_checker=True
                 )
@@ -138,7 +137,7 @@ class Judge:
         for module in config.imports:
             check_module("task.imports", module)
             try:
-                with _quiet():
+                with quiet(1, 2):
                     importlib.import_module(module)
             except Exception as error:  # whatever its code raises
                 raise ConfigError(
@@ -240,23 +239,3 @@ def succeeded(info: Mapping[str, Any]) -> bool | None:
     """Whether `info` reports success, by `is_success` or `success`; None if it has neither."""
     found = info.get(SUCCESS, info.get("success"))
     return None if found is None else bool(found)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Discard what engines written in C print: they do not use sys.stdout or sys.stderr."""
-    try:
-        kept = {number: os.dup(number) for number in (1, 2)}
-    except OSError:  # this process has none
-        yield
-        return
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        for number in kept:
-            os.dup2(null, number)
-        yield
-    finally:
-        for number, old in kept.items():
-            os.dup2(old, number)
-            os.close(old)
-        os.close(null)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from tangram_core.arrays import Complex, Floats, Ints, Singles
+from tangram_sim.geometry.dissections import less
 from tangram_sim.targets.connected import MAX_PILE
 from tangram_vision.pictures.blobs import find_blobs, likeness
 from tangram_vision.pictures.edges import NARROW, WIDE, Outlines
@@ -139,13 +140,13 @@ class _Search:
         area = float(blobs.area[-1])
         single = [] if not laid else self._single(blobs.moments[-1:], blobs.centre[-1], area, left)
         for kind, pose in single:
-            now = _without(left, self._kinds[kind].shape)
+            now = less(left, self._kinds[kind].shape)
             yield from self._rest(others, now, (*laid, kind), np.vstack([poses, pose]))
         most = MAX_PILE - len(laid) - len(blobs) + 1
         if not single and most > 1 and self._sums(area, left, most):
             for kind, pose in self.corners(part, area, left, len(laid)):
                 here = ramps([self._kinds[kind]], pose[None], rest.shape[0])[0]
-                now = _without(left, self._kinds[kind].shape)
+                now = less(left, self._kinds[kind].shape)
                 gone = np.clip(rest - here, 0.0, 1.0).astype(np.float32)
                 yield from self._rest(gone, now, (*laid, kind), np.vstack([poses, pose]))
 
@@ -271,10 +272,6 @@ class _Search:
         body = self._kinds[kind].corners @ (1.0, 1j)
         one, two = body * np.exp(1j * pose[2]), body * np.exp(1j * that[2])
         return bool(np.abs(one[:, None] - two).min(axis=1).max() < 1.5)
-
-
-def _without(left: tuple[int, ...], shape: int) -> tuple[int, ...]:
-    return tuple(count - (number == shape) for number, count in enumerate(left))
 
 
 def _inner_points(kind: Kind) -> Complex:

@@ -88,7 +88,7 @@ class Beam:
         return [
             State(
                 (*state.laid, place.laid),
-                less(state.left, place.laid),
+                less(state.left, place.laid.shape),
                 without(state.rest, place.polygon, tolerance, self._tokens.unit),
                 state.over + place.over,
             )

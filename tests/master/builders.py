@@ -23,7 +23,7 @@ from master.learn.lockstep import Lockstep
 from master.learn.trainer import Trainer
 from master.loop import Loop
 from master.record import journal as journal_module
-from master.record.delivery import EpisodesArrived, Ledger, ScoresArrived
+from master.record.delivery import EpisodesArrived, Ledger
 from master.record.journal import Journal, Place
 from master.record.rundir import Claim, Clock, Record, RunFolder
 from master.signals import StopSignals
@@ -55,11 +55,11 @@ def arrival(made: Setup, sequence: int, count: int = 4, version: int = 0) -> Epi
     return EpisodesArrived("player", 0, 1, batch, batch.encode(made.spec))
 
 
-def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
+def scores(made: Setup, version: int, reward: float = 0.5) -> Scores:
     """An evaluation with a picture."""
     picture = np.full((120, PICTURE_WIDTH, 3), 200, np.uint8)
     scalars = {"mean_reward": reward, "coverage": 0.75, "episodes": 100.0}
-    return ScoresArrived(0, 1, Scores(version, scalars, picture))
+    return Scores(version, scalars, picture)
 
 
 _opened: list[Journal | Claim] = []

@@ -303,7 +303,7 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
     made.run()
     shutil.rmtree(folder)
     for _ in range(2):
-        made.reporter.scored(scores(MADE, 4).scores)
+        made.reporter.scored(scores(MADE, 4))
         made.reporter.flush(0)
         made.reporter.metrics._try(made.reporter.metrics._writer.flush)
     with pytest.raises(
@@ -322,7 +322,7 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
 def test_test_episodes_are_drawn_while_it_learns(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, batches(1)))
     assert not made.folder.picture.exists()
-    made.reporter.scored(scores(MADE, 0).scores)
+    made.reporter.scored(scores(MADE, 0))
     with Image.open(made.folder.picture) as picture:
         assert picture.format == "PNG"
 

@@ -42,6 +42,7 @@ from tangram_core.wire.messages import (
     WeightsMessage,
     Welcome,
     decode_from_master,
+    decode_weights,
 )
 from tangram_core.wire.schema import Message, ProtocolError
 from worker.talk.connection import Connection, Sockets, Timing
@@ -89,7 +90,7 @@ class Client:
     ) -> None:
         self.stats: dict[str, float] = {}
         self.counters: Counter[str] = Counter()
-        self.outbox, self.newest = Outbox(window), NewestWeights(shapes)
+        self.outbox, self.newest = Outbox(window), NewestWeights()
         self.joined = False
         self.on_progress: Callable[[], None] = lambda: None
         self._timing = timing or Timing()
@@ -340,7 +341,7 @@ class Client:
         if frame is None:
             return
         try:
-            self.newest.offer_frame(frame)
+            self.newest.offer(*decode_weights(frame, self._shapes))
         except WireError as error:
             self.counters["malformed"] += 1
             self._warn("bad_weights", "weights from %s are refused: %s", error)

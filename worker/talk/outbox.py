@@ -1,8 +1,6 @@
 """Buffers of a worker: unacknowledged batches, and the newest weights."""
 
 from tangram_core.agent import Weights
-from tangram_core.wire.arrays import WeightShapes
-from tangram_core.wire.messages import decode_weights
 
 
 class Outbox:
@@ -52,8 +50,7 @@ class NewestWeights:
     Weights of another epoch (one start of the master) are dropped. The version is -1 at first.
     """
 
-    def __init__(self, shapes: WeightShapes | None) -> None:
-        self._shapes = shapes
+    def __init__(self) -> None:
         self.epoch = ""
         self.version = -1
         self._fresh: Weights | None = None
@@ -67,10 +64,6 @@ class NewestWeights:
         """Set the epoch; in a new epoch (a restarted master) versions begin again."""
         if epoch != self.epoch:
             self.epoch, self.version, self._fresh = epoch, -1, None
-
-    def offer_frame(self, frame: bytes) -> None:
-        """Decode a broadcast and keep it if it is newer; WireError as in `decode_weights`."""
-        self.offer(*decode_weights(frame, self._shapes))
 
     def offer(self, epoch: str, weights: Weights) -> None:
         """Keep weights if they are newer."""

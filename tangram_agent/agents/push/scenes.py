@@ -118,9 +118,7 @@ class Tokens:
 
     def after(self, left: Tensor, moved: Tensor, which: Tensor) -> Tensor:
         """Remaining ways (..., 3) after tokens move by (..., 3) in their own frames."""
-        way = rotated(left[..., :2] - moved[..., :2], -moved[..., 2])
-        turn = self.wrapped(left[..., 2] - moved[..., 2], which)
-        return torch.cat([way, turn[..., None]], dim=-1)
+        return self.left(moved, left, which)
 
     def laid(self, poses: Tensor, which: Tensor) -> Tensor:
         """Outlines (2, C, ...) of tokens at poses (..., 3)."""

@@ -19,6 +19,7 @@ from tangram_agent.agents.push.scenes import (
     placed_at,
     rotated,
 )
+from tangram_agent.nets.graph import unit
 from tangram_tasks.push.places import ARENA
 
 LEFT = 9  # features of a remaining way
@@ -87,20 +88,16 @@ def seen_by(tokens: Tokens, scene: Scene, slots: Tensor, others: Tensor) -> Seen
         right, up = points[0] - x, points[1] - y
         return torch.stack([cos * right + sin * up, cos * up - sin * right], dim=-1)
 
-    def heading(angles: Tensor) -> Tensor:
-        turn = angles - pose[:, 2]
-        return torch.stack([torch.cos(turn), torch.sin(turn)], dim=-1)
-
     at = rows, others
     poses, goals, kinds = scene.poses[at], scene.goals[at], scene.which[at]
     other = [
         ways(tokens, left[at]),
         tokens.outlines[kinds].flatten(1) * _LARGE,
         here(poses.T),
-        heading(poses[:, 2]),
+        unit(poses[:, 2] - pose[:, 2]),
         here(tokens.laid(poses, kinds)).movedim(0, 1).flatten(1),
         here(goals.T),
-        heading(goals[:, 2]),
+        unit(goals[:, 2] - pose[:, 2]),
     ]
     there = (scene.present[at] & (others != slots)).to(pose.dtype)[:, None]
     each = (slots[:, None] + torch.arange(1, count, device=slots.device)) % count

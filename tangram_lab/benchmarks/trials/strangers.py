@@ -3,6 +3,7 @@
 import selectors
 import socket
 import struct
+from contextlib import suppress
 from typing import Self
 from urllib.parse import urlsplit
 
@@ -25,19 +26,13 @@ def connection(endpoint: str) -> socket.socket:
     return socket.create_connection((place.hostname or "", place.port or 0))
 
 
-def subscribe(endpoint: str, size: int) -> bool:
-    """Subscribe to a topic of `size` bytes without keys; False if the master closes the socket."""
-    with connection(endpoint) as one:
-        try:
-            one.sendall(NULL + READY + LARGE + SIZE.pack(1 + size) + b"\x01" + bytes(size))
-            one.settimeout(1.0)
-            while one.recv(4096):
-                pass
-        except TimeoutError:
-            return True
-        except ConnectionError:
+def subscribe(endpoint: str, size: int) -> None:
+    """Subscribe to a topic of `size` bytes without keys, and wait until the master closes."""
+    with connection(endpoint) as one, suppress(TimeoutError, ConnectionError):
+        one.sendall(NULL + READY + LARGE + SIZE.pack(1 + size) + b"\x01" + bytes(size))
+        one.settimeout(1.0)
+        while one.recv(4096):
             pass
-        return False
 
 
 class Strangers:

@@ -9,6 +9,7 @@ from tangram_core.errors import WireError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
+from tangram_sim.motion.actions import corner_bound
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.builders import Policy
 from tests.master.builders import trainer
@@ -100,7 +101,7 @@ def test_nonsense_that_keeps_its_bounds_harms_nobody() -> None:
     """Whoever has the keys may send any numbers: the master learns nonsense, and goes on."""
     made, generator = trainer(MADE), np.random.default_rng(0)
     played = rolled_out(MADE)
-    for high in (0.0, 1e-3, 0.5, MADE.task.bound):
+    for high in (0.0, 1e-3, 0.5, corner_bound(MADE.task.layout.tokens, MADE.task.sim)):
         noise = generator.uniform(-high, high, played["goals"].shape).astype(np.float32)
         corners = generator.uniform(-high, high, played["corners"].shape).astype(np.float32)
         made.insert(Episodes({**played.arrays, "goals": noise}))

@@ -38,11 +38,13 @@ def test_what_an_action_moves(arena: float) -> None:
 
 @pytest.mark.parametrize("backend", ["kinematic", "physics"])
 def test_a_step_draws_nothing(backend: str) -> None:
+    own = evaluation_generators(3)
     with closing(begun(backend=backend)) as env:
-        _ = [generator.random() for generator in env._generators]
+        env.reset(own)
+        _ = [generator.random() for generator in own]
         env.step(np.full((3, 3), 0.1))
-        _ = [generator.random() for generator in env._generators]
-        after = [generator.random() for generator in env._generators]
+        _ = [generator.random() for generator in own]
+        after = [generator.random() for generator in own]
     fresh = evaluation_generators(3)
     with closing(BatchedEnv(ONE, SimConfig(backend="kinematic"), RewardConfig(), 3)) as other:
         other.reset(fresh)

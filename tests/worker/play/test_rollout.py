@@ -10,7 +10,7 @@ import pytest
 
 from tangram_core.seeding import episode_generator
 from tangram_core.setup import Setup
-from tangram_core.spec import Arrays, Episodes, joined
+from tangram_core.spec import Arrays, Episodes
 from tangram_sim.geometry.overlap import covered_share
 from tangram_tasks.env import PlaceEnv
 from tangram_tasks.played import Played
@@ -74,7 +74,8 @@ def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
             rollout.play(exploring(acting.actor), groups) for groups in (1, count // envs - 1)
         ]
         assert rollout.episode == count
-    return joined(played)
+    names = played[0].arrays
+    return Episodes({n: np.concatenate([one[n] for one in played]) for n in names})
 
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 2)])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from master.hub.hub import Hub
-from master.record.delivery import Arrival, ScoresArrived
+from master.record.delivery import Arrival
 from tangram_core.run.service import ServiceConfig
-from tangram_core.wire.messages import PICTURE_WIDTH
+from tangram_core.wire.messages import PICTURE_WIDTH, Scores
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy, sent, weights
 from tests.worker.talk.conversation import QUICK, collect, open_hub, with_master
@@ -37,23 +37,22 @@ def config(hub: Hub, service: ServiceConfig = SERVICE) -> WorkerConfig:
 def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict) -> None:
     made = setup(tokens, pixels=32)
 
-    def script(hub: Hub) -> list[ScoresArrived]:
+    def script(hub: Hub) -> list[Scores]:
         hub.publish(sent(made, 5))
         first = collect(hub, bool)
         # The interval of an hour does not hold up the last version: no other follows it.
         for version in (6, 7, 8):
             hub.publish(sent(made, version))
-        return first + collect(hub, lambda found: found and found[-1].scores.weights_version == 8)
+        return first + collect(hub, lambda found: found and found[-1].weights_version == 8)
 
     hub = open_hub(made)
     arrived, status = with_master(hub, script, lambda: run_evaluator(config(hub), made))
     assert status == 0
-    versions = [one.scores.weights_version for one in arrived]
+    versions = [one.weights_version for one in arrived]
     assert versions[0] == 5
     assert versions == sorted(set(versions))
     with closing(FixedTests(made.task, 20, 6)) as tests:
-        for one in arrived:
-            found = one.scores
+        for found in arrived:
             expected = tests.play(greedy(policy(made, found.weights_version).actor))
             scalars = dict(found.scalars)
             assert scalars.pop("seconds") >= 0.0

@@ -5,7 +5,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tangram_core.agent import Weights
-from tests.agent.messages import SHAPES
 from worker.talk.outbox import NewestWeights, Outbox
 
 pytestmark = pytest.mark.fast
@@ -38,7 +37,7 @@ def test_a_window_may_shrink_below_what_is_kept() -> None:
 
 
 def test_newest_weights_are_those_of_the_present_life() -> None:
-    kept = NewestWeights(SHAPES)
+    kept = NewestWeights()
     kept.begin("a")
     assert kept.take() is None
     for version in (3, 5, 4):
