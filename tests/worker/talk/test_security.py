@@ -449,18 +449,19 @@ def test_an_evaluator_of_the_run_itself_is_believed_before_others(file: Path) ->
     with staged(keys=keys) as stage:
         theirs, ours = raw(stage, keys, guest), raw(stage, keys, keys.evaluator)
 
-        def scored(end: Any, version: int) -> Any:
+        def scored(end: Any, version: int, reward: float) -> Any:
             stage.hub.publish(weights(version))
-            end.send_multipart(replace(scores(), weights_version=version).encode(SPEC))
+            sent = replace(scores(), weights_version=version, scalars={"mean_reward": reward})
+            end.send_multipart(sent.encode(SPEC))
             return asked(stage, end, Heartbeat({}))
 
         assert isinstance(asked(stage, theirs, hello(role="evaluator", process="a")), Welcome)
-        assert scored(theirs, 1) == Alive(1)
+        assert scored(theirs, 1, 0.25) == Alive(1)
         assert isinstance(asked(stage, ours, hello(role="evaluator", process="b")), Welcome)
         told = "evaluator 0: the run's own evaluator scores the weights"
-        assert scored(theirs, 2) == Reject(told, sequence=0, final=True)
-        assert scored(ours, 2) == Alive(2)
-        assert [one.index for one in stage.arrivals] == [0, 1]
+        assert scored(theirs, 2, 0.5) == Reject(told, sequence=0, final=True)
+        assert scored(ours, 2, 0.75) == Alive(2)
+        assert [one.scalars["mean_reward"] for one in stage.arrivals] == [0.25, 0.75]
 
 
 def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
