@@ -66,8 +66,9 @@ class Adam:
             # tanh that is used again, but computes an expm1 anew for every 16 weights.
             passed = (-math.log(beta) * steps[0] for beta in BETAS)
             whole, square = (torch.tanh(0.5 * x) * (1.0 + torch.exp(-x)) for x in passed)
+            rate, factor = rate / whole, 1.0 / square
             for one in zip(self._parameters, gradients, means, squares, strict=True):
-                _told(*one, rate / whole, 1.0 / square)
+                _told(*one, rate, factor)
             return
         adam(
             self._parameters,

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tangram_core.errors import ConfigError
-from tangram_core.run.process import VARIABLE, Lifeline, watch_parent
+from tangram_core.run.process import VARIABLE, Lifeline, quiet, watch_parent
 
 pytestmark = pytest.mark.cluster
 
@@ -203,6 +203,21 @@ def test_memory_that_was_freed_is_kept() -> None:
     """Without it the system gives the same pages again and again, large ones or small ones."""
     kept, given = (int(_output(FREEING, memory)) for memory in ("kept", "given"))
     assert 10 * kept < given
+
+
+def test_what_c_code_prints_is_discarded_and_later_lines_are_not(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    with quiet(1, 2):
+        os.write(1, b"lost")
+        os.write(2, b"lost")
+    os.write(1, b"kept")
+    os.write(2, b"told")
+    assert capfd.readouterr() == ("kept", "told")
+    gone = os.dup(1)
+    os.close(gone)
+    with quiet(gone):  # like the stderr of a process that has none
+        pass
 
 
 def _output(code: str, *arguments: str) -> str:
