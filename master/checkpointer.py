@@ -200,7 +200,7 @@ def _place(counters: Mapping[str, Any]) -> Place | None:
     if found is None:
         return None
     try:
-        return msgspec.convert({"segment": found} if isinstance(found, int) else found, Place)
+        return msgspec.convert(found, Place)
     except msgspec.ValidationError as error:
         raise RunError(
             f"its position in the journal cannot be read ({error}): delete the checkpoint to use "

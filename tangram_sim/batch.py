@@ -19,7 +19,6 @@ from tangram_sim.geometry.overlap import covered_share, outlines, shared_area
 from tangram_sim.motion.actions import (
     action_size,
     chosen_tokens,
-    corner_bound,
     flips,
     goal_rows,
     horizon,
@@ -89,7 +88,6 @@ class BatchedEnv:
         spec: names, shapes and bounds of the arrays in an episode.
         horizon: steps of an episode, K * actions_per_token.
         action_size: A.
-        bound: largest |coordinate| that a corner can reach, arena units.
         goal_rows: G, rows of a target as agents see it.
         steps_done: steps taken in this episode.
         corners: (B, V, 2) of the tokens.
@@ -129,8 +127,8 @@ class BatchedEnv:
         check_shown(sim, outlines)
         if sim.looks and eye is None:
             raise ConfigError(
-                f"sim.observe={sim.observe} is for tangram-train, tangram-worker and tangram-eval, "
-                "which look at pictures: set sim.observe=corners"
+                f"sim.observe={sim.observe} needs an eye, which finds tokens in pictures: set "
+                "sim.observe=corners"
             )
         self.layout = layout
         self.sim = sim
@@ -140,7 +138,6 @@ class BatchedEnv:
         self.count = count
         self.horizon = horizon(layout.tokens, sim)
         self.action_size = action_size(layout.tokens, sim)
-        self.bound = corner_bound(layout.tokens, sim)
         self.goal_rows = goal_rows(layout, sim)
         self._ends_by_placing = layout.tokens > 1 or sim.actions_per_token == 1
         self._worlds = [make_world(layout, sim) for _ in range(count)]

@@ -2,9 +2,8 @@
 
 One agent carries tokens. Another one leads a finger that pushes them.
 
-A page may change the scene at any time. So a move depends only on its arguments, and on the pushes
-of the last round. A token is "placed" if it lies in its piece. A token that was dragged or pushed
-away is moved again.
+A page may change the scene at any time. So a move depends only on its arguments. A token is
+"placed" if it lies in its piece. A token that was dragged or pushed away is moved again.
 
 Legend: K tokens, F frames.
 """
@@ -45,6 +44,22 @@ class Sides(NamedTuple):
     flipped: Bools
 
 
+class Action(NamedTuple):
+    """An action of a round: its token, and what the agent saw and chose.
+
+    With a token that is turned over, the finger's agent sees a mirror image.
+
+    Attributes:
+        token: index of the token.
+        corners: (V, 2) of the tokens before it.
+        chosen: (A,) the agent's action.
+    """
+
+    token: int
+    corners: Floats
+    chosen: Singles
+
+
 @dataclass(frozen=True, eq=False)
 class Move:
     """The result of one move.
@@ -56,7 +71,7 @@ class Move:
         blocked: whether other tokens were in the way, so that the token lies where it was.
         coverage: share of the figure that is covered after the move.
         iou: intersection over union of tokens and figure after the move.
-        done: tokens that were moved in this round, this one included.
+        done: actions of this round, this one included.
         ended: whether no token has an action left in this round.
     """
 
@@ -65,7 +80,7 @@ class Move:
     blocked: bool
     coverage: float
     iou: float
-    done: tuple[int, ...]
+    done: tuple[Action, ...]
     ended: bool
     finger: Floats | None = None
 
@@ -93,10 +108,11 @@ class _Finger:
             self._unknowns = env.unknowns[0]
         self._table = PushTable(self._task.layout, self._task.config.finger)
         self.most = self._task.spec.horizon
-        self._made = list[tuple[Floats, Singles]]()  # corners before each push of a round, the push
 
-    def push(self, scene: Sides, goal: Sides, made: int) -> tuple[int, Floats, Floats] | None:
-        """The next push: token, frames (F, K, 3), and places of the finger (F, 2).
+    def push(
+        self, scene: Sides, goal: Sides, done: tuple[Action, ...]
+    ) -> tuple[Action, Floats, Floats] | None:
+        """The next push: the action, frames (F, K, 3), and places of the finger (F, 2).
 
         None if all tokens are placed, or if the finger cannot come down. The agent knows the pushes
         of this round, so it does not repeat a push that had no effect.
@@ -111,11 +127,9 @@ class _Finger:
         if self._task.placed(corners[None], goals[None]).all():
             return None
         seen = {"corners": corners[None], "goals": goals[None]}
-        del self._made[made:]
-        moments = np.stack([*(before for before, _ in self._made), corners])[None]
-        actions = np.reshape([one for _, one in self._made], (1, -1, 4)).astype(np.float32)
+        moments = np.stack([*(one.corners for one in done), corners])[None]
+        actions = np.reshape([one.chosen for one in done], (1, -1, 4)).astype(np.float32)
         action = self._run.act(seen, History({"corners": moments}, actions))
-        self._made.append((corners, action[0]))
         push = push_of(layout, corners, action[0], config.finger, config.longest)
         if push.refused:
             return None
@@ -126,7 +140,8 @@ class _Finger:
             frames[at:] = self._table.poses()
         if image:
             frames, path = layout.mirrored(frames, scene.flipped)[0], path * (1.0, -1.0)
-        return int(chosen_tokens(action.astype(np.float64), layout.tokens)[0]), frames, path
+        token = int(chosen_tokens(action.astype(np.float64), layout.tokens)[0])
+        return Action(token, corners, action[0]), frames, path
 
 
 @lru_cache(maxsize=1)
@@ -153,34 +168,35 @@ def begin(goal: Sides, seed: int) -> Floats:
     return poses
 
 
-def next_move(scene: Sides, goal: Sides, motion: str, done: tuple[int, ...]) -> Move:
+def next_move(scene: Sides, goal: Sides, motion: str, done: tuple[Action, ...]) -> Move:
     """The next move towards a figure.
 
     Args:
         scene: the tokens as they lie.
         goal: the figure.
         motion: lift to carry a token, push to push it.
-        done: tokens that were moved in this round. A round carries each token once, or has as many
-            pushes as an episode.
+        done: actions of this round. A round carries each token once, or has as many pushes as an
+            episode.
     """
     return (_push if motion == "push" else _carry)(scene, goal, done)
 
 
-def _carry(scene: Sides, goal: Sides, done: tuple[int, ...]) -> Move:
+def _carry(scene: Sides, goal: Sides, done: tuple[Action, ...]) -> Move:
     own = player()
     env, layout = own.env, own.layout
     placed = _placed(scene, goal)
-    placed[[*done]] = True
+    placed[[one.token for one in done]] = True
     starts = Starts(scene.poses[None], scene.flipped[None], placed[None])
     targets = goal.poses[None], goal.flipped[None]
     env.reset([np.random.default_rng(0)], targets, starts=starts)
     token, blocked, frames = None, False, scene.poses[None]
     if not placed.all():
-        before = layout.poses(env.corners)[0]
+        corners, before = env.corners[0].copy(), layout.poses(env.corners)[0]
         seen = {"corners": env.seen, "placed": env.closed, "goals": env.seen_goals}
-        result = env.step(own.run.act(seen).astype(np.float64))
+        action = own.run.act(seen)
+        result = env.step(action.astype(np.float64))
         tried = int(result.tokens[0])
-        done = (*done, tried)
+        done = (*done, Action(tried, corners, action[0]))
         after = layout.poses(env.corners)[0]
         if result.blocked[0] or np.abs(after - before).max() > _STILL:
             token, blocked, frames = tried, bool(result.blocked[0]), np.stack([before, after])
@@ -188,14 +204,15 @@ def _carry(scene: Sides, goal: Sides, done: tuple[int, ...]) -> Move:
     return Move(token, frames, blocked, *scores, done, bool(placed.all()))
 
 
-def _push(scene: Sides, goal: Sides, done: tuple[int, ...]) -> Move:
+def _push(scene: Sides, goal: Sides, done: tuple[Action, ...]) -> Move:
     own = finger()
-    found = own.push(scene, goal, len(done)) if len(done) < own.most else None
+    found = own.push(scene, goal, done) if len(done) < own.most else None
     if found is None:
         return Move(None, scene.poses[None], False, *_scores(scene, goal), done, ended=True)
-    token, frames, path = found
+    action, frames, path = found
     scores = _scores(Sides(frames[-1], scene.flipped), goal)
-    return Move(token, frames, False, *scores, (*done, token), ended=False, finger=path)
+    done = (*done, action)
+    return Move(action.token, frames, False, *scores, done, ended=False, finger=path)
 
 
 def _scores(scene: Sides, goal: Sides) -> tuple[float, float]:

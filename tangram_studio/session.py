@@ -15,7 +15,7 @@ from tangram_studio import filling, playing, saving
 from tangram_studio.filling import Answer
 from tangram_studio.jobs import Jobs
 from tangram_studio.messages import Fill, Next, Play, Save, read, write
-from tangram_studio.playing import Move, Sides
+from tangram_studio.playing import Action, Move, Sides
 
 ROUNDS = 5  # of a figure, at most, so that an agent without success ends, too
 LAID = 0.95  # IoU from which a figure counts as laid
@@ -33,7 +33,7 @@ class Game:
         goal: the figure.
         motion: lift: tokens are carried; push: a finger pushes them.
         scene: the tokens as they lie.
-        done: tokens that were moved in this round.
+        done: actions of this round.
         rounds: number of rounds before this one.
         moved: whether a token was moved in this round.
     """
@@ -41,7 +41,7 @@ class Game:
     goal: Sides
     motion: str
     scene: Sides
-    done: tuple[int, ...] = ()
+    done: tuple[Action, ...] = ()
     rounds: int = 0
     moved: bool = False
 

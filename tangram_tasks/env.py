@@ -32,7 +32,7 @@ class PlaceEnv(Env):
 
     def __init__(self, task: "Place", count: int, purpose: Purpose) -> None:
         """Open the worlds; purpose `test` turns the camera on, unless agents see outlines."""
-        self.count = count
+        self.count, self._outlines = count, task.outlines
         shown = task.sim.observe == "silhouette"
         if purpose == "test" and not shown and not task.sim.pixels:
             task = task.with_sim(pixels=PIXELS)
@@ -84,13 +84,16 @@ class PlaceEnv(Env):
 
     def told(self) -> Json:
         """Coverage, success, reward by pictures (Eq. 14), and why nothing moved."""
-        from tangram_tasks.metrics import SOLVED  # noqa: PLC0415  # scipy, which no worker needs
+        from tangram_tasks.metrics import SOLVED, iou  # noqa: PLC0415  # scipy, no worker needs it
 
         world, result = self.world, self._result
         if result is None:
             return {}
         share, token = float(result.overlap[0]), int(result.tokens[0])
-        info: Json = {"coverage": share, "is_success": share >= SOLVED}
+        solved = share
+        if self._outlines:
+            solved = float(iou(world.layout, world.corners, result.overlap)[0])
+        info: Json = {"coverage": share, "is_success": solved >= SOLVED}
         if result.camera_rewards is not None:
             info["reward_camera"] = float(result.camera_rewards[0])
         if result.refused[0]:

@@ -46,7 +46,7 @@ class Fill(Place):
 
         tokens = shapely.polygons(outlines(achieved.astype(np.float64), self.layout))
         areas = np.array([as_area(rows) for rows in desired])
-        shared = shapely.area(shapely.intersection(tokens, areas[:, None])).sum(axis=1)
+        shared = shapely.area(shapely.intersection(shapely.union_all(tokens, axis=1), areas))
         return scaled_overlap(np.clip(shared / self.layout.areas.sum(), 0.0, 1.0))
 
     def score(self, played: Played) -> dict[str, float]:

@@ -16,7 +16,7 @@ from tangram_core.errors import ConfigError
 from tangram_core.settings import check_range
 from tangram_core.setup import from_mapping
 from tangram_core.spec import Array, Arrays
-from tangram_core.task import Task
+from tangram_core.task import Purpose, Task
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_tasks.place import Place
@@ -40,13 +40,20 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
 
-    def __init__(self, task: Task, render_mode: str | None = None, render_size: int = 240) -> None:
+    def __init__(
+        self,
+        task: Task,
+        render_mode: str | None = None,
+        render_size: int = 240,
+        purpose: Purpose = "play",
+    ) -> None:
         """Make the environment.
 
         Args:
             task: the task to play, such as `load_run(...).setup.task`.
             render_mode: None or rgb_array.
             render_size: side of the rendered picture in pixels.
+            purpose: test plays the episodes of tests: without `task.fewer`, and with the camera.
 
         Raises:
             ConfigError: an argument is out of its range, or the task cannot be played.
@@ -59,7 +66,7 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         check_range("render_size", render_size, 1, MAX_SIDE)
         task.check(plays=True)
         self.task, self.render_mode, self._size = task, render_mode, render_size
-        self._env, spec = task.make(1), task.spec
+        self._env, spec = task.make(1, purpose), task.spec
         self._steps, self._ended = spec.horizon, False  # no episode yet
         self._fields = [one for one in spec.fields if one.name != spec.desired]
         self.action_space = spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32)

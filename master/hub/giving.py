@@ -9,21 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from master.config import KeysConfig
-from master.hub.security import (
-    NAME,
-    PRIVATE,
-    Given,
-    Keys,
-    holders,
-    make_pair,
-    read_keys,
-    write_keys,
-)
+from master.hub.security import NAME, Given, Keys, holders, make_pair, read_keys, write_keys
 from master.record.audit import write_line
 from master.record.rundir import RunFolder
 from tangram_core.errors import UNREADABLE, ConfigError, RunError
 from tangram_core.run.code import argument
-from tangram_core.store.files import private, write_whole
+from tangram_core.store.files import PRIVATE, private, write_whole
 from tangram_core.wire.messages import ROLES
 
 TCP = "tcp://"

@@ -24,9 +24,8 @@ from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.run.outcome import bound_of, read_outcome
 from tangram_core.setup import section_names
 from tangram_core.store.checkpoints import list_checkpoints
-from tangram_core.store.files import PUBLIC, is_same, make_folders, private, write_whole
+from tangram_core.store.files import PRIVATE, PUBLIC, is_same, make_folders, private, write_whole
 
-PRIVATE = 0o600
 LOCK, LAUNCHER, LEASE = ".lock", ".launcher", ".lease.json"
 
 

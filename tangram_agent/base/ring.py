@@ -97,9 +97,8 @@ class Ring:
         for name, array in self.arrays.items():
             array[slots] = state[name][order]
 
-    def check_valid(self, state: Mapping[str, Array] | None = None) -> None:
-        """Raise RunError if columns of the ring, or of a state, have wrong shapes or numbers."""
-        found = self.state() if state is None else state
+    def check_valid(self, found: Mapping[str, Array]) -> None:
+        """Raise RunError if columns of a state have wrong shapes or numbers."""
         added = int(found[self._counter][0]) if self._counter in found else -1
         kept = len(found.get(next(iter(self.arrays)), ()))
         for name, column in self._columns.items():

@@ -8,7 +8,7 @@ from tempfile import TemporaryFile
 
 from tangram_core.errors import ConfigError, RunError
 
-PUBLIC = 0o644
+PUBLIC, PRIVATE = 0o644, 0o600
 
 
 def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True) -> None:

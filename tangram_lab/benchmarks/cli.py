@@ -59,7 +59,9 @@ def _parser() -> argparse.ArgumentParser:
             one.add_argument("--id", help="gymnasium id of one task (five of Fetch and Panda)")
             one.add_argument("--minutes", type=float, default=60.0, help="per training (60)")
             one.add_argument("--seeds", type=int, default=1, help="seeds per task, from 0 (1)")
-            one.add_argument("--agent", default="goal", help="our preset: goal or push (goal)")
+            one.add_argument(
+                "--agent", default="goal", help="our preset: goal or goal_large (goal)"
+            )
             one.add_argument("--workers", type=int, default=0, help="our workers (0: by cores)")
             one.add_argument("--rows", type=Path, help="CSV file: trainings in it are not repeated")
     for name, text in TRIALS.items():

@@ -21,6 +21,7 @@ from tangram_sim.geometry.overlap import outlines_at, pairs_overlap
 
 MAX_TRIES = 1000  # random poses tried for one token before sampling gives up
 _CHUNK = 4  # poses drawn at once when some may overlap, for fewer and larger checks
+_TOUCHING = 1e-9  # an overlap that counts as rounding, in squares of the reach
 _CLEAR_TRIES = 64  # tries to keep clear of `avoid`; then it is ignored
 
 Generators = Sequence[np.random.Generator]
@@ -127,7 +128,8 @@ def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) ->
     drawn_outlines = outlines_at(piece.body, drawn.reshape(-1, 3), np.repeat(flipped, size))
     own = np.repeat(drawn_outlines, before, axis=0)
     others = np.repeat(obstacles, size, axis=0).reshape(len(own), -1, 2)
-    return np.asarray(pairs_overlap(own, others).reshape(rows, size, before).any(axis=2))
+    overlap = pairs_overlap(own, others, _TOUCHING * piece.reach**2)
+    return np.asarray(overlap.reshape(rows, size, before).any(axis=2))
 
 
 def check_fits(layout: Layout, sim: SimConfig) -> Floats:

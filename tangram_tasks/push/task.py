@@ -63,7 +63,7 @@ class PushConfig(Settings, section="task"):
         "as far as its joints allow",
         choices=("finger", "panda"),
     )
-    longest: float = setting(0.5, "length of the longest push", low=0.05, high=2)
+    longest: float = setting(0.5, "length of the longest push", low=0.05, high=1)
     pixels: int = setting(
         0,
         "side of the pictures in which tokens are found, from 16; 0: agents see exact corners",

@@ -60,7 +60,7 @@ def test_equals_a_naive_oracle_under_random_operations(seed: int) -> None:
                 fresh = buffer(capacity)
                 fresh.load_state({k: v.copy() for k, v in replay.state().items()})
                 replay = fresh
-        replay.check_valid()
+        replay.check_valid(replay.state())
         assert len(replay) == len(oracle)
         assert replay.added == number
         assert rewards(replay) == sorted(oracle)
@@ -90,10 +90,8 @@ def test_samples_every_kept_transition_alike_and_no_other(added: int, kept: rang
 def test_bad_numbers_are_found_and_not_taken_over(name: str, value: float, reason: str) -> None:
     replay = buffer(4)
     replay.add(numbered(0, 2))
-    replay.check_valid()
+    buffer(4).load_state(replay.state())
     replay.state()[name].reshape(-1)[0] = value
-    with pytest.raises(RunError, match=reason):
-        replay.check_valid()
     with pytest.raises(RunError, match=reason):
         buffer(4).load_state(replay.state())
 

@@ -144,5 +144,5 @@ def test_what_is_missing_travels_and_is_not_learned_from() -> None:
 
 def test_without_an_eye_pictures_are_refused() -> None:
     task = setup("square")
-    with pytest.raises(ConfigError, match="^sim.observe=pictures is for tangram-train, .*corners$"):
+    with pytest.raises(ConfigError, match="^sim.observe=pictures needs an eye, .*corners$"):
         BatchedEnv(task.task.layout, task.task.sim, task.task.reward)

@@ -173,11 +173,6 @@ class FillReplay:
         self._played.load_state(state)
         self._filled.load_state(state)
 
-    def check_valid(self) -> None:
-        """Raise RunError if a kept number is not finite or an index exceeds its bounds."""
-        self._played.check_valid()
-        self._filled.check_valid()
-
 
 def _named(name: str, rests: Rests) -> dict[str, Array]:
     return {f"{name}_{part}": array for part, array in vars(rests).items()}

@@ -110,4 +110,4 @@ def test_nonsense_that_keeps_its_bounds_harms_nobody() -> None:
         flags = generator.integers(0, 2, played["placed"].shape).astype(np.uint8)
         made.insert(Episodes({**played.arrays, "placed": flags}))
     assert np.isfinite(list(made.update(0.0).values())).all()
-    made.learner.replay.check_valid()
+    made.learner.load_memory(made.learner.memory())  # checks each number

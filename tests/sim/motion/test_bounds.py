@@ -91,7 +91,7 @@ def test_no_world_leaves_the_bound(seed: int, monkeypatch: pytest.MonkeyPatch) -
                 before = env.layout.poses(env.corners)
                 ahead[:, 0] = -0.5 if step < sim.actions_per_token else 0.5
                 env.step(ahead)
-                assert np.abs(env.seen).max() <= env.bound
+                assert np.abs(env.seen).max() <= env.spec.field("corners").high
                 way = np.abs(env.layout.poses(env.corners) - before)[..., :2].max()
                 assert way <= sim.arena * (1.0 + slack)
 
@@ -101,4 +101,8 @@ def test_a_token_alone_goes_as_far_as_the_bound_says() -> None:
     with closing(begun(actions_per_token=3)) as env:
         for _ in range(3):
             env.step(np.ones((3, 3)))
-        assert 0.9 * env.bound < np.abs(env.corners).max() <= env.bound
+        assert (
+            0.9 * env.spec.field("corners").high
+            < np.abs(env.corners).max()
+            <= env.spec.field("corners").high
+        )

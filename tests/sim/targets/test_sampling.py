@@ -53,7 +53,7 @@ def test_a_small_test_set_is_the_beginning_of_a_large_one() -> None:
         (layout_of("square"), 2.0),
         (layout_of(*TRIO, LOPSIDED, scale=0.2), 2.0),
         (layout_of(*SEVEN, scale=0.9), 2.0),  # a fifth of the arena is filled
-        (layout_of("square", "square", scale=0.01), 0.02),
+        (layout_of(*SEVEN, scale=0.0003), 0.001),
     ],
 )
 def test_tokens_lie_inside_and_apart(layout: Layout, arena: float) -> None:
