@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tangram_core.arrays import Singles
+from tangram_core.arrays import Ints, Singles
 from tangram_core.errors import ConfigError
 
 Array = npt.NDArray[Any]
@@ -160,6 +160,12 @@ class Episodes:
     def transitions(self) -> int:
         """E * T, the number of transitions."""
         return self.count * self.steps
+
+    @property
+    def lengths(self) -> Ints:
+        """Steps (E,) until each episode first terminated; T if it did not."""
+        ended = self.terminated.astype(bool)
+        return np.where(ended.any(1), ended.argmax(1) + 1, self.steps)
 
     def at(self, rows: Any) -> "Episodes":
         """The selected episodes; `rows`: an index array, a slice or a mask."""

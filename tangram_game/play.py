@@ -29,6 +29,7 @@ from tangram_game.show.film import WIDTH, Show, film_pictures, frames_per_action
 from tangram_game.show.views import beside, camera_sheets
 from tangram_sim.drawing.game_drawing import figure_sheet, tiles
 from tangram_sim.drawing.scenes import episode_sheet, save_gif, save_mp4
+from tangram_sim.drawing.strokes import FRAME, PAPER
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.kinematics import wrap
 from tangram_tasks.metrics import SOLVED, assembled
@@ -44,7 +45,6 @@ SEEN = 30  # frames of the picture with the target, before a film
 SHEET = 720  # pixels across, about
 MIN_TILE, MAX_TILE = 64, 240
 GAP = 24  # pixels between pictures
-PAPER, RULE = (250, 250, 247), (214, 214, 208)
 
 
 def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
@@ -280,7 +280,7 @@ def side_by_side(panels: Sequence[Image.Image]) -> Image.Image:
     left = 0
     for panel in panels:
         if left:
-            draw.line((left - GAP // 2, 8, left - GAP // 2, height - 8), RULE)
+            draw.line((left - GAP // 2, 8, left - GAP // 2, height - 8), FRAME)
         canvas.paste(panel, (left, 0))
         left += panel.width + GAP
     return canvas

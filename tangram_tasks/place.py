@@ -140,10 +140,18 @@ class Place(Task):
         return np.asarray(sheet.convert("RGB"))
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """The baselines by name; see `tangram_tasks.rivals.every`."""
-        from tangram_tasks.rivals.every import rivals_of  # noqa: PLC0415
+        """The baselines by name, the strongest first; see `tangram_tasks.rivals.baselines`."""
+        from tangram_tasks.rivals.baselines import (  # noqa: PLC0415
+            exact_policy,
+            position_policy,
+            random_policy,
+        )
 
-        return rivals_of(self.layout, self.sim)
+        layout, sim = self.layout, self.sim
+        found: dict[str, Callable[[Env], Chooser]] = {"exact": lambda _: exact_policy(layout, sim)}
+        if layout.tokens == 1:
+            found["position only"] = lambda _: position_policy(layout, sim)
+        return found | {"random": lambda _: random_policy(layout, sim)}
 
     def identity(self) -> Json:
         """Token geometry, sim and reward, which must be equal on master and workers."""

@@ -23,6 +23,10 @@ OBSERVATION, ACHIEVED, DESIRED = "observation", "achieved_goal", "desired_goal"
 MOST = 1e6  # largest observed number; only errors lie beyond
 FAR = 1e3  # entry of a goal that is tried where its space has no bounds
 TRIED = 10  # random steps that are played for inspection
+INSTALL = (  # apart: panda-gym needs PyBullet, which is not built for every Python
+    "install its package; for Fetch: pip install gymnasium-robotics 'mujoco<3.12'; for Panda: pip "
+    "install panda-gym"
+)
 Environment = gymnasium.Env[Any, Any]
 
 
@@ -76,8 +80,7 @@ class Judge:
         except Exception as error:  # whatever the environment's own code raises
             why = f"{type(error).__name__}: {error}".strip().splitlines()[0]
             raise ConfigError(
-                f"task.id={self._config.id} cannot be made ({why}): install its packages; "
-                "for Fetch and Panda: pip install gymnasium-robotics 'mujoco<3.12' panda-gym"
+                f"task.id={self._config.id} cannot be made ({why}): {INSTALL}"
             ) from error
 
     def scaled(self, actions: Singles) -> Singles:
@@ -141,9 +144,7 @@ class Judge:
                     importlib.import_module(module)
             except Exception as error:  # whatever its code raises
                 raise ConfigError(
-                    f"task.imports: cannot import {module} ({error}): install its package; "
-                    "for gymnasium_robotics and panda_gym: pip install gymnasium-robotics "
-                    "'mujoco<3.12' panda-gym"
+                    f"task.imports: cannot import {module} ({error}): {INSTALL}"
                 ) from error
         try:
             horizon = gymnasium.spec(config.id).max_episode_steps

@@ -123,10 +123,8 @@ class Gym(Task):
 
     def score(self, played: Played) -> dict[str, float]:
         """Compute the scores; an episode ends where it first terminates, else at its last step."""
-        terminated = played.episodes.terminated.astype(bool)
-        horizon = terminated.shape[1]
+        horizon, last = played.episodes.steps, played.episodes.lengths - 1
         success = played.facts[SUCCESS][:, 1:].astype(bool)  # (E, T) after each step
-        last = np.where(terminated.any(1), terminated.argmax(1), horizon - 1)
         first = np.where(success.any(1), success.argmax(1) + 1, horizon)
         counts = np.arange(horizon) <= last[:, None]
         return {

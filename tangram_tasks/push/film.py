@@ -38,8 +38,7 @@ class Replayed:
         self.shown = self.corners  # corners that the agent saw
         if task.config.pixels:
             self.shown = played.episodes["corners"][episode].astype(np.float64)
-        ended = played.episodes.terminated[episode].astype(bool)
-        self.count = int(ended.argmax()) + 1 if ended.any() else len(ended)
+        self.count = int(played.episodes.lengths[episode])
         names = ("table", "spread", "finger", "centres")
         table, spread, finger, centres = (facts[name][0] for name in names)
         self.unknowns = Unknowns(table, spread, float(finger), centres)

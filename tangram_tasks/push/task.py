@@ -299,7 +299,6 @@ class Push(Task):
 
 def _ends(played: Played) -> tuple[Bools, Ints, Floats]:
     """(E,) whether all came into place, (E,) after how many pushes, and corners (E, V, 2) then."""
-    terminated = played.episodes.terminated.astype(bool)
-    solved = np.asarray(terminated.any(axis=1))
-    last = np.where(solved, terminated.argmax(axis=1) + 1, terminated.shape[1])
+    solved = np.asarray(played.episodes.terminated.any(axis=1))
+    last = played.episodes.lengths
     return solved, last, played.facts["corners"][np.arange(len(last)), last]

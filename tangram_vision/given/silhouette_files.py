@@ -19,6 +19,7 @@ from shapely import Polygon
 
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.errors import ConfigError
+from tangram_sim.drawing.strokes import PAPER
 from tangram_sim.geometry.areas import Area, valid
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
@@ -31,7 +32,7 @@ from tangram_vision.silhouettes.tilts import mapped, shift
 
 _DRAWN = 640  # pixels along the longer side of an outline's picture
 _BORDER = 0.1  # of the outline's longer side, around the outline
-_INK, _PAPER = (55, 60, 68), (250, 250, 247)
+_INK = 55, 60, 68
 _LINES = 4  # a line drawing encloses this many times its own area; tans around a hole, less
 _OFF = 0.05  # of the tokens' area: error of the area of a drawing of known scale, at most
 
@@ -128,7 +129,7 @@ def _mask(area: Area, size: tuple[int, int], unit: float) -> Bools:
 
 
 def _inked(mask: Bools) -> Image.Image:
-    return Image.fromarray(np.where(mask[..., None], _INK, _PAPER).astype(np.uint8))
+    return Image.fromarray(np.where(mask[..., None], _INK, PAPER).astype(np.uint8))
 
 
 def _from_picture(given: Given, source: str, layout: Layout, seconds: float) -> Silhouette:

@@ -69,7 +69,7 @@ def pieces(layout: Layout, found: Dissection) -> list[Polygon]:
 
 def covered(layout: Layout, found: Dissection) -> Area:
     """The area that the tokens of a dissection cover."""
-    size = _ROUND * float(np.sqrt(layout.areas.sum()))
+    size = _ROUND * unit_of(layout)
     return shapely.union_all(pieces(layout, found), grid_size=size)
 
 

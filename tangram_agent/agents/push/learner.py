@@ -76,13 +76,6 @@ class Batch:
         return Scene(poses, self.goals, self.which, self.present)
 
 
-def lengths(terminated: Array) -> Ints:
-    """Number of steps (E,) until episodes (E, T) first terminated; T if they did not."""
-    ended = terminated.astype(bool)
-    counts: Ints = np.where(ended.any(1), ended.argmax(1) + 1, ended.shape[1])
-    return counts
-
-
 class PushReplay(EpisodeReplay):
     """Replay buffer whose hindsight goals are reached poses of all tokens, or of some."""
 
@@ -113,7 +106,7 @@ class PushReplay(EpisodeReplay):
 
     def _look(self, slots: Ints) -> None:
         """Store the lengths of new episodes."""
-        self._lengths[slots] = lengths(self.arrays["terminated"][slots])
+        self._lengths[slots] = Episodes(self.arrays).at(slots).lengths
 
     @cached_property
     def _lengths(self) -> Ints:
@@ -158,7 +151,7 @@ class PushLearner(NetworkLearner):
     def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
         """Add whole episodes; their goals are relabelled when a batch is drawn."""
         self.replay.add(episodes)
-        return int(lengths(episodes.terminated).sum())
+        return int(episodes.lengths.sum())
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
         """Make one update of all networks; every 20th time renew the table of pushes."""

@@ -2,8 +2,8 @@
 
 Both train at the same time, each on half of the cores, and on the GPU if there is one. Both
 normalise inputs, and both use our network sizes, batch size, learning rate, discount and updates
-per step. Stable-Baselines3 has its other settings from RL Zoo. RL Zoo's own sizes (3 x 512, batches
-of 2,048, one update per step) would be too slow on a few cores.
+per step, and targets that follow as fast. Stable-Baselines3 has its exploration from RL Zoo. RL
+Zoo's own sizes (3 x 512, batches of 2,048, one update per step) would be too slow on a few cores.
 """
 
 import importlib
@@ -34,6 +34,7 @@ from tangram_lab.benchmarks.measure import Row, told
 from tangram_lab.benchmarks.setups import goal_config, robot
 from tangram_lab.benchmarks.trainings import start_training
 from tangram_lab.figures import COLOURS, legend_below, new_figure, save
+from tangram_tasks.gym.judge import INSTALL
 
 STAGE, LIBRARY = "fetch", "stable_baselines3"
 TASKS = (
@@ -98,9 +99,7 @@ def measure_fetch(matches: Sequence[Match], rows: Path | None) -> list[Row]:
     name, there = label(), _read(rows)
     for module in {match.module for match in matches}:
         if find_spec(module) is None:
-            raise ModuleNotFoundError(
-                f"{module} is missing: pip install gymnasium-robotics 'mujoco<3.12' panda-gym"
-            )
+            raise ModuleNotFoundError(f"{module} is missing: {INSTALL}")
     for match in matches:
         key = asdict(match)
         if not _of(there, match).empty:
@@ -263,7 +262,7 @@ def train(match: Match, cores: Sequence[int]) -> None:
         replay_buffer_class=library.HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         seed=match.seed,
-        tau=1.0 - same.polyak,
+        tau=2.0 * (1.0 - same.polyak),  # only every second update moves their targets
         train_freq=(round(1.0 / same.updates_per_transition), "step"),
     )
     model.set_logger(logger.Logger(None, []))
