@@ -409,9 +409,10 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
     try:
         content = load_settings(Path(path).read_text(encoding="utf-8"), source)
     except OSError as error:
-        raise ConfigError(f"{source}: {error.strerror or error}") from None
+        why = error.strerror or error
+        raise ConfigError(f"{source}: {why}: name the config.yaml of a run") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"{source} is not valid YAML (it is no UTF-8): correct it") from None
+        raise ConfigError(f"{source} is not UTF-8: save it as UTF-8") from None
     return source, content if isinstance(content, dict) else {}
 
 

@@ -33,8 +33,8 @@ class Score:
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name) or self.name in COUNTS:
             raise ConfigError(
-                f"a score's name has small letters, digits and _, at most 41, got {self.name!r}: "
-                "give it another"
+                "a score's name begins with a small letter, has small letters, digits and _, at "
+                f"most 41, and is not {' or '.join(COUNTS)}, got {self.name!r}: choose another name"
             )
         fits = len(self.label) <= MAX_LABEL and len(self.unit) <= MAX_UNIT
         if not (fits and 0 <= self.digits <= MAX_DIGITS):

@@ -89,8 +89,8 @@ class Env(ABC):
             generators: B random generators, one for each environment.
 
         Returns:
-            Observations: every field of the spec with one row for each moment or episode, (B,
-            *shape), in its dtype or a more exact one.
+            Observations: the fields of the spec per moment or per episode, (B, *shape), in their
+            dtypes or more exact ones.
         """
 
     @abstractmethod

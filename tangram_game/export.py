@@ -201,7 +201,7 @@ def _player(run: Run, content: bytes) -> Callable[[Arrays], Singles]:
 def _unwritten(run: Run, why: str) -> RunError:
     return RunError(
         f"{run.folder} cannot be written as ONNX: {why.strip().splitlines()[0]}: use other "
-        "operations in graph()"
+        "operations in the graph() of its actor"
     )
 
 

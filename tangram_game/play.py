@@ -134,9 +134,10 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
     source, names = source_and_names(config.puzzle or ())
     figures = find_figures(source, task, names, config.turns)
     if len(figures) > MAX_SHOWN:
+        first = ",".join((source, figures[0].name) if source else (figures[0].name,))
         raise ConfigError(
-            f"there are {len(figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
-            f"in puzzle=[{figures[0].name}]"
+            f"{len(figures)} figures are too many to show, at most {MAX_SHOWN}: name some, as in "
+            f"puzzle=[{first}], or lower turns"
         )
     played = play_figures(task, figures, by(run.actor), config.seed)
     return Show(task, played, [one.title for one in figures], "puzzle")

@@ -61,7 +61,8 @@ def _check_camera(layout: Layout, sim: SimConfig) -> None:
         shown = (sim.pixels / side.max()) ** 2
         raise ConfigError(
             f"reward.source=camera needs tokens of at least {LEAST_SHOWN} pixels, and {worst.name} "
-            f"covers {shown:.3g}: raise sim.pixels from {sim.pixels} to {pixels}"
+            f"covers {shown:.3g} pixels: raise sim.pixels to {pixels} (at most 1024), or lower "
+            "sim.view or sim.arena"
         )
 
 

@@ -48,7 +48,7 @@ class Answer:
     """How the tokens fill a silhouette.
 
     Attributes:
-        goal: poses of the tokens, in the middle of the arena.
+        goal: poses and sides of the tokens, in the middle of the arena.
         exact: whether the tokens fill the silhouette; if not, they are the nearest figure found.
         iou: intersection over union of tokens and silhouette.
         how: how the silhouette was filled, or why not, in words.

@@ -62,7 +62,7 @@ class TaskEnv(gymnasium.Env[Observation, Singles]):
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode must be None or rgb_array, got '{render_mode}'")
         if not isinstance(render_size, int | np.integer):
-            raise ConfigError(f"render_size must be a whole number, got {render_size}")
+            raise ConfigError(f"render_size must be a whole number, got {render_size!r}: set 240")
         check_range("render_size", render_size, 1, MAX_SIDE)
         task.check(plays=True)
         self.task, self.render_mode, self._size = task, render_mode, render_size

@@ -217,9 +217,9 @@ LAUGHS = b"a0: &a0 {b: 1}\n" + b"".join(
     [
         (None, "No such file"),
         (b"a: [", "is not valid YAML \\(while parsing"),
-        (b"[" * 10_000, "is no file of settings: it must have .* and 20 levels"),
-        (LAUGHS, "is no file of settings: .* 10000 values with what aliases repeat"),
-        (b"\xff\xfe\xfa", "is not valid YAML \\(it is no UTF-8"),
+        (b"[" * 10_000, "is too large for settings: it must have .* and 20 levels"),
+        (LAUGHS, "is too large for settings: .* 10000 values with what aliases repeat"),
+        (b"\xff\xfe\xfa", "is not UTF-8: save"),
         (b"3", "names no task: it must have task.kind"),
         (
             b"{task: {kind: place}, agent: {kind: pair}, net: {}}",
@@ -343,9 +343,13 @@ def test_presets_of_ones_own_are_taken(entered: Entered, presets: Path, form: st
     [
         ("tokens/mine.yaml", "scale: 1\n", "set tokens.shapes=..., it has no default"),
         ("tokens/mine.yaml", "shapes: [", "/tokens/mine.yaml cannot be read (while parsing"),
-        ("tokens/mine.yaml", "[" * 10_000, "/tokens/mine.yaml is no file of settings: it must"),
-        ("tokens/mine.yaml", LAUGHS.decode(), "/tokens/mine.yaml is no file of settings: it must"),
-        ("tokens/mine.yaml", "&a [*a]", "/tokens/mine.yaml is no file of settings: it must"),
+        ("tokens/mine.yaml", "[" * 10_000, "/tokens/mine.yaml is too large for settings: it must"),
+        (
+            "tokens/mine.yaml",
+            LAUGHS.decode(),
+            "/tokens/mine.yaml is too large for settings: it must",
+        ),
+        ("tokens/mine.yaml", "&a [*a]", "/tokens/mine.yaml is too large for settings: it must"),
         ("tokens/mine.yaml", "x" * 100_001, "it must have at most 100000 characters"),
         (
             "tokens/mine.yaml",

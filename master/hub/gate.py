@@ -61,8 +61,8 @@ class Room:
         room = Room(MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES))
         if room.peers < 1:
             raise ConfigError(
-                f"this process may open {room.files} files, too few for one worker: allow at "
-                f"least {RESERVE + HANDSHAKES + DESCRIPTORS} (ulimit -n)"
+                f"this process may open {room.files} files, too few for one worker: raise the hard "
+                f"limit (ulimit -Hn) to at least {RESERVE + HANDSHAKES + DESCRIPTORS}"
             )
         resource.setrlimit(resource.RLIMIT_NOFILE, (room.files, hard))
         return room
@@ -82,7 +82,7 @@ class Room:
         """End of a message about a full master: what sets the limit, and how to raise it."""
         if self.files >= MOST_FILES:
             return "there can be"
-        return f"that {self.files} open files allow: raise ulimit -n and start the master again"
+        return f"that {self.files} open files allow: raise ulimit -Hn and start the master again"
 
 
 AMPLE = Room(MOST_FILES)

@@ -125,7 +125,7 @@ class Hub:
 
     @property
     def peers(self) -> list[Peer]:
-        """Processes that take part, by role and index."""
+        """Processes that take part, sorted by role and index."""
         return self._registry.peers
 
     def count(self, role: str) -> int:

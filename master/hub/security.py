@@ -143,8 +143,8 @@ def read_keys(path: Path) -> Keys:
                 raise ValueError(f"the key of {name} has a wrong length")
     except (*UNREADABLE, struct.error, msgspec.MsgspecError, zmq.ZMQError) as error:
         raise RunError(
-            f"{path} does not hold the run's keys ({error}): delete the file to make new keys, "
-            "then start the present workers again"
+            f"{path} does not hold the run's keys ({error}): put a copy back, or delete the file, "
+            "start master and workers again, and make other keys anew"
         ) from None
     return replace(keys, path=path)
 

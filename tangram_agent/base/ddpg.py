@@ -116,7 +116,10 @@ class Ddpg(TokenLearner):
         return self.steps(self.batch, rng["hindsight"])
 
     def losses(self, seen: Steps) -> Iterator[Loss]:
-        """Yield the losses of the critic, Eq. 3, and the actor, Eq. 6: minus its actions' value."""
+        """Yield the critic's loss, Eq. 3, and if the batch acts, the actor's.
+
+        That is minus the value of its actions, Eq. 6, and a penalty for saturated ones.
+        """
         features = self.features(seen)
         with torch.no_grad():
             y = self._target(seen)

@@ -23,7 +23,7 @@ class Choice:
     Attributes:
         token: (B,) index of the token that moves.
         flip: (B,) whether the token is turned over.
-        velocity: (B, 3) in [-1, 1], takes the token to its chosen pose.
+        velocity: (B, 3) clipped to [-1, 1], moves the token towards its chosen pose.
     """
 
     token: Ints

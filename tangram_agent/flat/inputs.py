@@ -38,7 +38,8 @@ class Inputs:
             if field.dtype != "f4":
                 raise ConfigError(
                     f"this agent needs fields of float numbers (f4), but {field.name} of this task "
-                    f"is {field.dtype}: set another task, or an agent for such fields"
+                    f"is {field.dtype}: leave agent= out to use the task's own agent, or declare "
+                    "the field of your own task as f4"
                 )
 
     def rows(self, seen: Arrays) -> Singles:

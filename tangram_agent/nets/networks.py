@@ -104,7 +104,7 @@ def untraced() -> None:
     """
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         raise ConfigError(
-            "torch.jit.trace would repeat the choices for one scene in all: use tangram-export"
+            "torch.jit.trace would keep the choices made for one scene for all: use tangram-export"
         )
 
 

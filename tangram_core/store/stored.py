@@ -44,6 +44,6 @@ def check_extent(text: str, source: str) -> None:
             break
     if large:
         raise ConfigError(
-            f"{source} is no file of settings: it must have at most {MAX_TEXT} characters, "
-            f"{MAX_VALUES} values with what aliases repeat, and {MAX_DEPTH} levels"
+            f"{source} is too large for settings: it must have at most {MAX_TEXT} characters, "
+            f"{MAX_VALUES} values with what aliases repeat, and {MAX_DEPTH} levels: shorten it"
         )

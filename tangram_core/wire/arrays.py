@@ -110,7 +110,7 @@ class Column:
 
 @lru_cache
 def columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
-    """The arrays of `count` episodes, in the order of the spec's fields."""
+    """The arrays of `count` episodes, in the order of `spec.every`."""
     return tuple(_column(field, (count, *field.rows(spec.horizon))) for field in spec.every)
 
 

@@ -155,7 +155,7 @@ class EpisodeBatch(Table):
 
     @classmethod
     def columns(cls, agreed: EpisodeSpec, count: int) -> Sequence[Column]:
-        """One column for each field of the spec."""
+        """One column for each array of an episode."""
         return columns(agreed, count)
 
     def arrays(self) -> Mapping[str, Any]:

@@ -94,14 +94,14 @@ def compare(
     runs: int,
     bound: Bound | None = None,
 ) -> Row:
-    """Measure two implementations in turns.
+    """Measure two implementations in turns; print and return the row.
 
     Args:
         labels: stage, case and unit.
         ours: our implementation.
         theirs: name and implementation of the rival.
         runs: number of measurements of each.
-        bound: required bound of the ratio.
+        bound: required bound of ours / theirs; None: no bound.
     """
     found = rates({"ours": ours, "theirs": theirs[1]}, runs)
     return compared(labels, found["ours"], theirs[0], found["theirs"], bound)

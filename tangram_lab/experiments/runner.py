@@ -71,8 +71,8 @@ class Work:
         told = read_json(self.run_dir / TOLD).get("told", list(self.job.told))
         if told != list(self.job.told):
             raise ConfigError(
-                f"{self.run_dir} was begun with {' '.join(told)}: remove this folder, or choose "
-                "another run_dir"
+                f"{self.run_dir} was begun with other settings ({' '.join(told)}, now "
+                f"{' '.join(self.job.told)}): remove this folder, or choose another run_dir"
             )
 
     def next(self) -> Child | None:

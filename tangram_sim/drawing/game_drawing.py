@@ -93,7 +93,7 @@ def draw_game(
 def figure_sheet(
     layout: Layout, arena: float, ends: Floats, goals: Floats, titles: Sequence[str]
 ) -> Image.Image:
-    """A sheet with one picture for each of E figures, captioned with name and covered share.
+    """A sheet with one picture for each of E figures, captioned with title and coverage.
 
     `ends` and `goals` are corners (E, V, 2) of tokens and targets.
     """
@@ -105,7 +105,7 @@ def figure_sheet(
 
 
 def captions(layout: Layout, ends: Floats, goals: Floats, titles: Sequence[str]) -> list[str]:
-    """The name and the covered share (per cent) of each figure, as a text."""
+    """The title and the coverage (per cent) of each figure, as a text."""
     covered = covered_share(ends, goals, layout)
     return [f"{title}   {100 * share:.1f} %" for title, share in zip(titles, covered, strict=True)]
 

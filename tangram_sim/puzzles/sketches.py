@@ -72,7 +72,7 @@ def read_text(path: Path, source: str | None = None) -> str:
 
 
 def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
-    """The puzzles of a JSON text in its order, or a list of faults for an unusable puzzle.
+    """For each puzzle of a JSON text, in order: its sketch, or its faults if it is unusable.
 
     Raises:
         ConfigError: the whole text is unusable; `source` is its name in errors.
@@ -143,7 +143,7 @@ def _sketches(entries: list[Any]) -> list[Sketch | list[str]]:
             name = checked_name(entry["name"], where)
             if name in names:
                 raise FaultError(
-                    f"puzzle '{name}': number {i + 1} has a name that is taken: rename it"
+                    f"{where}: the name '{name}' belongs to an earlier puzzle: rename one"
                 )
             names.add(name)
             pieces, wrong = _pieces(entry["pieces"], f"puzzle '{name}'")

@@ -24,8 +24,8 @@ MOST = 1e6  # largest observed number; only errors lie beyond
 FAR = 1e3  # entry of a goal that is tried where its space has no bounds
 TRIED = 10  # random steps that are played for inspection
 INSTALL = (  # apart: panda-gym needs PyBullet, which is not built for every Python
-    "install its package; for Fetch: pip install gymnasium-robotics 'mujoco<3.12'; for Panda: pip "
-    "install panda-gym"
+    "install its package; for Fetch: pip install gymnasium-robotics 'mujoco<3.12'; for Panda, with "
+    "Python 3.11 on x86-64: pip install panda-gym"
 )
 Environment = gymnasium.Env[Any, Any]
 

@@ -25,7 +25,7 @@ LEAST = 0.02  # length of the shortest push, after the finger has met the token
 
 
 def on_table(corners: AnyArray, layout: Layout) -> Bools:
-    """(..., K) which tokens with corners (..., V, 2) are on the table."""
+    """Whether each token is on the table (..., K), from the corners (..., V, 2)."""
     first: Bools = corners[..., layout.starts[:-1], 0] < AWAY - 0.5
     return first
 

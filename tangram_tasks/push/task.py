@@ -212,8 +212,8 @@ class Push(Task):
             begin(self.layout, self.count, np.random.default_rng(seed), self.figures)
         if plays and find_spec("pybullet") is None:
             raise ConfigError(
-                "task=push needs PyBullet, which is missing: pip install pybullet, or from Python "
-                "3.12 on pip install pybullet-arm64"
+                "task=push needs PyBullet, which is missing: pip install pybullet with Python 3.11 "
+                "on x86-64, otherwise pip install pybullet-arm64"
             )
         if plays and self.config.pixels and find_spec("cv2") is None:
             raise ConfigError(

@@ -1,9 +1,10 @@
 """Search for touching tokens ("a pile") that explain one common outline.
 
 At a convex corner of the outline some token has a corner, too, with an edge along a side of the
-outline. The search tries each token, each of its corners and both sides. A token that stays inside
-and explains most of the outline is subtracted, until the rest is a single token. Then all poses
-are fitted to all pixels together. The remaining difference of the pixels ranks the arrangements.
+outline. The search tries each token and each of its corners, with an edge along either side of the
+outline there. A token that stays inside and explains most of the outline is subtracted, until the
+rest is a single token. Then all poses are fitted to all pixels together. The remaining difference
+of the pixels ranks the arrangements.
 """
 
 from collections.abc import Iterator, Sequence

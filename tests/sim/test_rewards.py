@@ -107,7 +107,7 @@ def test_a_camera_too_coarse_for_a_token_is_refused_with_the_least_that_does() -
             ConfigError, match=r"of at least 16 pixels, and square covers .*: raise"
         ) as told:
             make_reward(config, layout, sim)
-        least = int(str(told.value).rpartition(" ")[2])
+        least = int(str(told.value).rpartition("sim.pixels to ")[2].split()[0])
         make_reward(config, layout, replace(sim, pixels=least))
         with pytest.raises(ConfigError, match="of at least 16 pixels"):
             make_reward(config, layout, replace(sim, pixels=least - 1))

@@ -279,7 +279,7 @@ def test_render() -> None:
         ({"render_mode": "3d"}, "render_mode must be None or rgb_array, got '3d'"),
         ({"gravity": 9.81}, "there is no setting sim.gravity: delete it"),
         ({"render_size": 0}, "render_size must be between 1 and 4096, got 0"),
-        ({"render_size": 10.5}, "render_size must be a whole number, got 10.5"),
+        ({"render_size": 10.5}, "render_size must be a whole number, got 10.5: set 240"),
         ({"scale": "big"}, "tokens.scale must be a number, got big"),
         ({"arena": -1.0}, "sim.arena must be"),
         ({"allow_flip": True}, "sim.allow_flip=true needs a token that is not its own mirror"),

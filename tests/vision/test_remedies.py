@@ -108,7 +108,7 @@ CASES: dict[str, tuple[Given, ...]] = {
     "a key is given twice .*: remove one": (file(TEXT.replace("{", '{"version": 1,')), file(TEXT)),
     "not JSON .*: check line 4 and the one before": (file(TEXT.replace("1,", "1")), file(TEXT)),
     "not JSON .*: check its .* numbers": (file(TEXT.replace("1.0", "9" * 5000)), file(TEXT)),
-    "has a name that is taken: rename it": (
+    "belongs to an earlier puzzle: rename one": (
         file(edited(TWO, "puzzles/1/name", "my_cat"), how=play_by_run),
         file(TWO, how=play_by_run),
     ),

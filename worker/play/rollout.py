@@ -143,7 +143,7 @@ def _play_group(
 
 
 class Rollout:
-    """Endless play for learning; every episode has its own random generator.
+    """Play for learning; every episode has its own random generator.
 
     Attributes:
         episode: number of the next episode in this incarnation of the worker.

@@ -103,7 +103,10 @@ class Run:
         until = time.monotonic() + PATIENCE_S
         while not ready(self.numbers()):
             if time.monotonic() > until:
-                raise TangramError(f"the run in {self.folder} makes no progress: see its file told")
+                told = (self.folder / "told").read_text(errors="replace")[-1000:]
+                raise TangramError(
+                    f"the run makes no progress for {PATIENCE_S:g} s; it told: {told}"
+                )
             time.sleep(0.5)
 
 

@@ -73,9 +73,9 @@ def huge_incarnations(target: Target) -> Seen:
 
 
 def large_topic(target: Target) -> Seen:
-    """Subscribe to a huge topic without keys, and to many large topics with keys.
+    """Subscribe to a topic of 16 MiB without keys, and to 64 topics of 32 KiB with keys.
 
-    ZeroMQ itself overflows its stack with still longer topics.
+    With longer ones, ZeroMQ overflows its own stack.
     """
 
     def topics() -> None:

@@ -76,7 +76,7 @@ def killed_after_huge_numbers(target: Target) -> Seen:
 
 
 def killed_after_unlink(target: Target) -> Seen:
-    """Delete the journal just after a checkpoint, so the next one is too late to replace it."""
+    """Delete the journal just after a checkpoint, then kill the master before the next one."""
     journal = target.folder / "journal"
     target.checkpoint()
     for path in segments(journal).values():

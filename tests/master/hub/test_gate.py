@@ -68,8 +68,8 @@ def test_no_room_for_a_single_worker_is_refused(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(ConfigError) as caught:
         Room.here()
     assert str(caught.value) == (
-        f"this process may open {FEW - 1} files, too few for one worker: allow at least "
-        f"{FEW} (ulimit -n)"
+        f"this process may open {FEW - 1} files, too few for one worker: raise the hard limit "
+        f"(ulimit -Hn) to at least {FEW}"
     )
 
 

@@ -106,7 +106,7 @@ DIFFERS = (
             {},
             "refused_full",
             f"0 processes take part, the most that {NO_ROOM.files} open files allow: raise "
-            "ulimit -n and start the master again",
+            "ulimit -Hn and start the master again",
         ),
     ],
 )

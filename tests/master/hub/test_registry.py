@@ -199,7 +199,7 @@ def test_a_full_room_lets_the_successor_of_a_process_in(registry: Registry) -> N
     dead, other = admitted(full, "a"), admitted(full, "b")
     successor, older = full.admit(b"c", hello(process="c", index=0), 1.0)
     assert (older, successor.incarnation, full.peers) == (dead, 2, [successor, other])
-    raised = "the most that 228 open files allow: raise ulimit -n and start the master again"
+    raised = "the most that 228 open files allow: raise ulimit -Hn and start the master again"
     for more in ({"index": 2}, {"index": 0, "role": "evaluator"}):  # theirs would be one more
         with pytest.raises(RefusedError, match=f"2 processes take part, {raised}") as caught:
             admitted(full, "d", **more)

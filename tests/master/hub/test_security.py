@@ -61,7 +61,9 @@ def test_a_file_that_holds_something_else_is_refused(tmp_path: Path, change: obj
     path = tmp_path / "keys.json"
     whole = isinstance(change, str)
     path.write_text(str(change) if whole else json.dumps(make_keys().content() | dict(change)))
-    with pytest.raises(RunError, match=r"keys\.json does not hold the run's keys .*: delete"):
+    with pytest.raises(
+        RunError, match=r"keys\.json does not hold the run's keys .*: put a copy back, or delete"
+    ):
         run_keys(path)
 
 

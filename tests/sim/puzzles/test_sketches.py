@@ -112,7 +112,10 @@ def at(path: str, value: Any) -> Callable[[Any], None]:
         (at("title", "x"), "puzzle number 2 must have exactly the keys name, pieces, got {'name'"),
         (at("name", ""), "puzzle number 2: name must be 1 to 64 printable characters, got ''"),
         (at("name", "a\nb"), r"name must be 1 to 64 printable characters, got 'a\nb'"),
-        (at("name", "duck"), "puzzle 'duck': number 2 has a name that is taken: rename it"),
+        (
+            at("name", "duck"),
+            "puzzle number 2: the name 'duck' belongs to an earlier puzzle: rename one",
+        ),
         (at("pieces", []), "puzzle 'cat': pieces must be a list of 1 to 16, got 0"),
         (at("pieces", [0] * 17), "puzzle 'cat': pieces must be a list of 1 to 16, got 17"),
         (at("pieces.0", 3), "puzzle 'cat', piece 1 must have exactly the keys shape, corners, go"),
