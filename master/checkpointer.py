@@ -91,7 +91,7 @@ class Checkpointer:
             self._keep_safe()
             self._journal.append(arrival)
             self._claim.check()  # the write may have hung for longer than a lease lasts
-        except (JournalError, FolderError, DiskError) as error:
+        except (OSError, JournalError, FolderError, DiskError) as error:
             self._failed(error)
             return False
         self._worked()
@@ -108,7 +108,7 @@ class Checkpointer:
                 self.save()
                 took_s = time.monotonic() - begun_s
                 self._checkpoint.rest(min(BETWEEN * took_s, MOST_BETWEEN_S))
-        except (JournalError, FolderError, DiskError) as error:
+        except (OSError, JournalError, FolderError, DiskError) as error:
             self._failed(error)
 
     def save(self) -> Path:
@@ -148,10 +148,13 @@ class Checkpointer:
             except RunError as error:  # only workers that join later need these files
                 log.warning("%s", error)
 
-    def _failed(self, error: RunError) -> None:
+    def _failed(self, error: RunError | OSError) -> None:
         self.failing, self.homeless = True, isinstance(error, FolderError)
         if self._tell.due():
-            remedies = {JournalError: f": {MAKE_ROOM}", FolderError: f": {PUT_BACK}"}
+            remedies: dict[type, str] = {
+                JournalError: f": {MAKE_ROOM}",
+                FolderError: f": {PUT_BACK}",
+            }
             log.warning("%s%s", error, remedies.get(type(error), ""))
 
     def _worked(self) -> None:

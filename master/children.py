@@ -153,10 +153,11 @@ class Child:
 
     def tail(self, count: int = TAIL_LINES) -> str:
         """The last lines of the log; empty if there is none."""
-        if self.log is None or not self.log.exists():
+        try:
+            text = self.log.read_text(encoding="utf-8", errors="replace") if self.log else ""
+        except OSError:  # none yet, or the disk failed
             return ""
-        lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
-        return "\n".join(lines[-count:])
+        return "\n".join(text.splitlines()[-count:])
 
     def _wait(self, handle: int, ended: Callable[["Child"], None]) -> None:
         _has_ended(handle, wait=True)

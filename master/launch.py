@@ -1,6 +1,7 @@
 """tangram-train: starts a master, its workers and an evaluator here; leaves no orphan process."""
 
 import logging
+import os
 import signal
 import sys
 import time
@@ -13,6 +14,7 @@ from typing import Any
 from master.children import Child, describe
 from master.config import MasterConfig
 from master.forking import warm_up
+from master.hub.gate import Room
 from master.hub.security import listening_place
 from master.record.resumable import check_resumable
 from master.record.rundir import LAUNCHER, RunFolder
@@ -58,6 +60,7 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
     Raises:
         TangramError: the run folder cannot be used.
     """
+    Room.here()  # each child needs some open files here
     folder = RunFolder(config.run_dir)
     folder.prepare(config.resume)
     # Held to the end: another training must not write its settings before the master has its lock.
@@ -171,7 +174,7 @@ class Launcher:
         """Start each child whose time has come; workers only while the master is reachable."""
         if self._stop_s is not None:
             return
-        reachable = self._folder.connection.exists()
+        reachable = os.path.exists(self._folder.connection)  # noqa: PTH110 - False if the disk fails
         self._reached = self._reached or reachable
         for child in [self._master, *(self._workers if reachable else ())]:
             if child.next_start_s is not None and time.monotonic() >= child.next_start_s:
@@ -253,7 +256,7 @@ class Launcher:
 
     def _worker_ended(self, child: Child) -> None:
         status = child.clear()
-        if self._reached and not self._folder.connection.exists():
+        if self._reached and not os.path.exists(self._folder.connection):  # noqa: PTH110
             child.next_start_s = 0.0  # the master dismissed it: start again if the master returns
             return
         if self._stop_s is not None:
@@ -271,9 +274,9 @@ class Launcher:
                 f"{child.name} ended with {describe(status)}: it is not started again\n"
                 f"{child.tail()}"
             )
-            if not any(player.kept for player in self._players):
+            if not (all if self._in_step else any)(player.kept for player in self._players):
                 self._failed = True
-                self._stop("no worker is left: the run ends")
+                self._stop("too few workers are left: the run ends")
 
     def _make_way(self, child: Child) -> None:
         """Start a child again that lost its index to a worker which a user started by hand."""

@@ -59,6 +59,8 @@ class RunError(TangramError):
 class WireError(TangramError):
     """A message that breaks the protocol."""
 
+    status = FAILED_STATUS
+
 
 def is_passing(error: BaseException | None) -> bool:
     """Whether the environment caused an error, directly or through the error's cause."""

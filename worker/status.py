@@ -71,12 +71,7 @@ def _print_result(console: Console, result: Mapping[str, Any], config: StatusCon
 def ask_status(
     connect: str, context: "zmq.Context[zmq.Socket[bytes]]", patience_s: float = PATIENCE_S
 ) -> RunStatus:
-    """The status of a run, as its master answers within `patience_s`.
-
-    Raises:
-        RunError: `connect` is no address or connection file.
-        TangramError: no connection file, unknown host, wrong keys, or no answer.
-    """
+    """The status of a run; RunError if `connect` is no address, TangramError without an answer."""
     address = find_master(connect)
     if address is None:
         raise TangramError(f"no connection file at {connect}: {_nobody(Path(connect) / CONFIG)}")

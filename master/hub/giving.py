@@ -10,14 +10,14 @@ from typing import Any
 
 from master.config import KeysConfig
 from master.hub.security import NAME, Given, Keys, holders, make_pair, read_keys, write_keys
-from master.record.audit import write_line
+from master.record.audit import Audit
 from master.record.rundir import RunFolder
 from tangram_core.errors import UNREADABLE, ConfigError, RunError
 from tangram_core.run.code import argument
 from tangram_core.store.files import PRIVATE, private, write_whole
+from tangram_core.wire.addresses import TCP
 from tangram_core.wire.messages import ROLES
 
-TCP = "tcp://"
 NEEDLESS = "these keys are not needed: the master uses unix sockets, or service.auth=off"
 STALE = (
     "service.port is 0, any free port, so this file is stale when the master is started again; "
@@ -88,7 +88,7 @@ def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[s
     mine = connection | {"keys": {config.role: asdict(pair)}}
     write_whole(out, json.dumps(mine, indent=1).encode(), PRIVATE)
     write_keys(folder.keys, replace(keys, given=given))
-    write_line(folder.audit, "key added", key=name, role=config.role)
+    Audit(folder.audit).note("key added", key=name, role=config.role)
     line = f"tangram-worker {argument('connect', out.name)} role={config.role}"
     told = [f"{out} lets {name} take part as {config.role} ({line}): send it over a private way"]
     if connection.get("settings", {}).get("service", {}).get("port") == 0:
@@ -102,7 +102,7 @@ def _revoke(folder: RunFolder, keys: Keys, name: str) -> str:
         raise ConfigError(f"revoke must name a key made by tangram-keys ({known}), got '{name}'")
     given = {one: key for one, key in keys.given.items() if one != name}
     write_keys(folder.keys, replace(keys, given=given))
-    write_line(folder.audit, "key revoked", key=name)
+    Audit(folder.audit).note("key revoked", key=name)
     return f"the key of {name} is revoked"
 
 

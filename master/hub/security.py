@@ -29,13 +29,12 @@ from tangram_core.errors import UNREADABLE, ConfigError, RunError
 from tangram_core.run.process import Every
 from tangram_core.run.service import ServiceConfig
 from tangram_core.store.files import PRIVATE, own_folder, write_whole
-from tangram_core.wire.addresses import IPC, LOCAL
+from tangram_core.wire.addresses import IPC, KEY_BYTES, LOCAL
 from tangram_core.wire.messages import ROLES
 
 DOMAIN = "tangram"
 MAX_SOCKET_PATH = 107  # bytes, of Linux
 NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")  # of a key
-KEY_BYTES = 32
 LOOK_S = 1.0  # between two checks of the key file
 
 log = logging.getLogger(__name__)

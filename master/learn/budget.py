@@ -19,16 +19,16 @@ class Budget:
 
     def __init__(self, config: MasterConfig, trainer: Trainer, record: Record) -> None:
         self._trainer, self._record = trainer, record
-        self.max_seconds = config.max_hours * HOUR_S
+        self.max_hours = float(config.max_hours)
         self.max_episodes = config.max_episodes
         self.max_updates = config.max_updates
-        self.bounded = bool(self.max_seconds or self.max_episodes or self.max_updates)
+        self.bounded = bool(self.max_hours or self.max_episodes or self.max_updates)
 
     @property
     def share(self) -> float:
         """The largest used share of a bound, in [0, 1]; 0 if no bound is set."""
         spent = (
-            (self._record.loop_s, self.max_seconds),
+            (self._record.loop_s, self.max_hours * HOUR_S),
             (self._trainer.episodes, self.max_episodes),
             (self._trainer.updates, self.max_updates),
         )
@@ -46,16 +46,15 @@ class Budget:
         """The bound that is reached and ends learning at once, as in `max_updates=9`, or None."""
         if self.updates_spent():
             return f"max_updates={self.max_updates}"
-        if self.max_seconds and self._record.loop_s >= self.max_seconds:
-            return f"max_hours={self.max_seconds / HOUR_S:g}"
+        if self.max_hours and self._record.loop_s >= self.max_hours * HOUR_S:
+            return f"max_hours={repr(self.max_hours).removesuffix('.0')}"  # all digits
         return None
 
 
 class Rates:
-    """Rates over the last `window_s` seconds, and the time left."""
+    """Rates over the last `RATE_WINDOW_S` seconds, and the time left."""
 
-    def __init__(self, window_s: float = RATE_WINDOW_S) -> None:
-        self.window_s = window_s
+    def __init__(self) -> None:
         self._marks: deque[tuple[float, int, int, float, float]] = deque()
         self._first: tuple[float, float] | None = None
 
@@ -66,7 +65,7 @@ class Rates:
         if self._first is None:
             self._first = (now_s, share)
         self._marks.append((now_s, transitions, updates, share, busy_s))
-        while len(self._marks) > 2 and now_s - self._marks[1][0] >= self.window_s:
+        while len(self._marks) > 2 and now_s - self._marks[1][0] >= RATE_WINDOW_S:
             self._marks.popleft()
 
     def transitions_per_s(self) -> float:

@@ -44,11 +44,6 @@ class RateLimiter:
                 "agent.updates_per_transition must be positive and finite, got "
                 f"{updates_per_transition}: no update would ever be made"
             )
-        if lag_updates < 1:
-            raise ConfigError(
-                f"the lag must be at least 1 update, got {lag_updates}: with less, no transition "
-                "could be inserted, so learner and workers would wait for each other for ever"
-            )
         self._rate, self._starts, self._limit = updates_per_transition, learning_starts, lag_updates
         self.transitions = 0
         self.updates = 0

@@ -33,9 +33,9 @@ log = logging.getLogger(__name__)
 
 
 class _Sturdy:
-    """A text file that drops its output when its reader is gone, and replaces unknown characters.
+    """A text file that drops what cannot be written, and replaces unknown characters.
 
-    A closed terminal or pipe must not end the run, and must not disturb its clean end.
+    A closed terminal or pipe, or a full disk, must not end the run, and not disturb its clean end.
     """
 
     def __init__(self, file: TextIO) -> None:
@@ -51,19 +51,22 @@ class _Sturdy:
             known = text.encode(self._file.encoding, "replace")
             return self._file.write(known.decode(self._file.encoding))
         except OSError:
-            return self._silence(text)
+            return self._drop(text)
 
     def flush(self) -> None:
         try:
             self._file.flush()
         except OSError:
-            self._silence("")
+            self._drop("")
 
-    def _silence(self, text: str) -> int:
-        null = os.open(os.devnull, os.O_WRONLY)
-        # Replace the descriptor itself: the buffer of the file is still written to it later.
-        os.dup2(null, self._file.fileno())
-        os.close(null)
+    def _drop(self, text: str) -> int:
+        own, null = self._file.fileno(), os.open(os.devnull, os.O_WRONLY)
+        before = os.dup(own)
+        os.dup2(null, own)
+        self._file.flush()  # the buffer, too; a disk that is full now may take what comes later
+        os.dup2(before, own)
+        for one in (before, null):
+            os.close(one)
         return len(text)
 
 

@@ -9,7 +9,8 @@ from tangram_core.errors import ConfigError
 
 DNS_S = 2.0  # longest wait for an answer
 LOCAL = "local"  # value of service.bind: unix sockets instead of an address
-IPC = "ipc://"
+IPC, TCP = "ipc://", "tcp://"
+KEY_BYTES = 32
 HOST = re.compile(r"[\w.*-]+")
 WILDCARDS = ("0.0.0.0", "*", "[::]")  # noqa: S104  # replaced, never bound
 # TCP keepalive finds dead connections. Pings of ZMTP can end the process that sends them: if a

@@ -33,7 +33,7 @@ MAX_WEIGHTS_BYTES = 64 * 2**20
 ROUNDING = 1e-6
 _LITTLE = {"f4": "<f4", "u1": "u1"}
 LENGTH = struct.Struct("<I")
-MAX_FRAMES = MAX_BATCH_BYTES // MAX_FRAME_BYTES + 8  # in a message; some are not full
+MAX_FRAMES = MAX_BATCH_BYTES // MAX_FRAME_BYTES + 64  # of arrays: the last of each is not full
 
 
 @dataclass(frozen=True)
@@ -230,8 +230,8 @@ def split_frames(data: bytes) -> list[bytes]:
     """Split the result of `join_frames`; WireError if a frame is incomplete, or for too many."""
     frames, start = list[bytes](), 0
     while start < len(data):
-        if len(frames) == MAX_FRAMES:
-            raise WireError(f"there may be {MAX_FRAMES} joined frames, got more")
+        if len(frames) > MAX_FRAMES:  # and a header
+            raise WireError(f"there may be {MAX_FRAMES + 1} joined frames, got more")
         begin = start + LENGTH.size
         size = LENGTH.unpack_from(data, start)[0] if begin <= len(data) else 0
         start = begin + size

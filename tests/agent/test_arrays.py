@@ -308,6 +308,8 @@ def test_joined_frames_come_back_and_none_that_is_cut_short(frames: list[bytes])
             split_frames(data[:size])
 
 
-def test_joined_frames_are_bounded_in_number() -> None:
-    with pytest.raises(WireError, match=f"there may be {MAX_FRAMES} joined frames, got more"):
-        split_frames(join_frames([b""] * (MAX_FRAMES + 1)))
+def test_joined_frames_are_those_of_a_message_with_its_header_and_no_more() -> None:
+    whole = [b""] * (1 + MAX_FRAMES)
+    assert split_frames(join_frames(whole)) == whole
+    with pytest.raises(WireError, match=f"there may be {MAX_FRAMES + 1} joined frames, got more"):
+        split_frames(join_frames([*whole, b""]))

@@ -103,6 +103,24 @@ def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> No
     assert len(list_checkpoints(stage.folder / "checkpoints")) == 2
 
 
+def test_a_disk_whose_files_cannot_be_looked_at_is_waited_for(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert stage.keep(1)
+    stage.checkpointer.save()
+    stage.checkpointer._look = Every(0.0)
+    with monkeypatch.context() as failing:
+        failing.setattr(Path, "is_dir", fails)
+        assert not stage.keep(2)
+        stage.checkpointer.tick()
+    assert stage.told == ["[Errno 5] Input/output error"]
+    assert stage.keep(2)
+
+
+def fails(_: Path) -> bool:
+    raise OSError(errno.EIO, "Input/output error")
+
+
 @pytest.mark.parametrize(("takes_s", "rests_s"), [(10.0, 90.0), (1000.0, 3600.0)])
 def test_a_slow_disk_takes_a_tenth_of_the_time_for_an_hour(
     stage: Stage, monkeypatch: pytest.MonkeyPatch, takes_s: float, rests_s: float

@@ -138,6 +138,7 @@ def test_a_child_has_its_own_session_niceness_thread_and_log(
     made.start(ended.put)
     assert ended.get(timeout=LIMIT_S) is made
     assert made.clear() == 7
+    assert made.tail() == ""
     (tmp_path / "log").rmdir()
 
     polite = child(

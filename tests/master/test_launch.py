@@ -1,5 +1,6 @@
 """Starting, restarting and ending children, with small real processes in place of the commands."""
 
+import errno
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -14,6 +15,7 @@ from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
 from master.config import MasterConfig
+from master.hub.gate import Room
 from master.launch import Launcher, master_arguments, run_training
 from master.record.rundir import RunFolder
 from master.watch.console import logging_to, sturdy_console
@@ -79,7 +81,10 @@ def test_a_training_that_begins_a_moment_later_writes_nothing(
         return 7
 
     monkeypatch.setattr(Launcher, "run", second)
+    files = list[str]()
+    monkeypatch.setattr(Room, "here", lambda: files.append("raised"))
     assert run_training(MasterConfig(str(tmp_path)), {"seed": 1}) == 7
+    assert files == ["raised"] * 2  # each child needs five here
     assert RunFolder(tmp_path).read_config() == {"seed": 1}
     monkeypatch.setattr(Launcher, "run", lambda _: 0)
     assert run_training(MasterConfig(str(tmp_path)), {"seed": 3}) == 0
@@ -511,7 +516,32 @@ def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(tmp_path: Path)
     assert told.count("it is started again") == MAX_RESTARTS
     assert "worker 0 ended with status 1: it is not started again\nwrong tokens\n" in told
     assert "worker 1 ended with status 2: it is not started again\nbad input\n" in told
-    assert told.endswith("no worker is left: the run ends\n")
+    assert told.endswith("too few workers are left: the run ends\n")
+
+
+@pytest.mark.cluster
+def test_in_lockstep_a_worker_that_is_given_up_ends_the_run(tmp_path: Path) -> None:
+    """A round would wait for its episodes for ever."""
+    made = launcher(tmp_path, players=[WORKER, "raise SystemExit(2)"])
+    made._in_step = True
+    status, told = finish(made, tmp_path)
+    assert status == 1
+    assert told.endswith("too few workers are left: the run ends\n")
+
+
+@pytest.mark.fast
+def test_a_disk_that_fails_starts_no_worker_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, started = launcher(tmp_path), list[str]()
+    monkeypatch.setattr(Child, "start", lambda child, _: started.append(child.name))
+
+    def fails(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(Path, "stat", fails)
+    made._start_due()
+    assert started == ["master"]
 
 
 @pytest.mark.cluster

@@ -412,7 +412,8 @@ class Client:
             # The batch before was refused by a master that was killed: HELLO tells what is first.
             self.joined, self._hello_at = False, now + self._timing.retry_s
         else:
-            self._resend_at = min(self._resend_at, now + self._timing.retry_s)
+            wait_s = self._timing.retry_s * self._patience_s / self._timing.resend_s
+            self._resend_at = min(self._resend_at, now + wait_s)
 
     def _warn(self, event: str, text: str, reason: object) -> None:
         log.warning(text, self._connection.place, reason, extra={"event": event})

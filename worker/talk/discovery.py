@@ -15,15 +15,13 @@ from zmq.utils import z85
 from tangram_core.errors import UNREADABLE, RunError, UnavailableError
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.store.files import check_own
-from tangram_core.wire.addresses import IPC, dns_error
+from tangram_core.wire.addresses import IPC, KEY_BYTES, TCP, dns_error
 
 FILE_NAME = "connection.json"
 # The master may still be starting, or waiting in the queue of a cluster.
 PATIENCE_S = 60.0
 LOOK_S = 0.2
-SCHEME = "tcp://"
 PLAIN_ADDRESS = re.compile(r"[\w.-]{1,249}:\d{1,5}|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
-KEY_BYTES = 32
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ def as_address(connect: str) -> str | None:
     if "://" in connect:
         return connect
     plain = PLAIN_ADDRESS.fullmatch(connect) and not Path(connect).exists()
-    return f"{SCHEME}{connect}" if plain else None
+    return f"{TCP}{connect}" if plain else None
 
 
 def find_master(connect: str) -> MasterAddress | None:
@@ -79,9 +77,9 @@ def find_master(connect: str) -> MasterAddress | None:
     if address is not None:
         return MasterAddress(_checked(address, connect))
     path = Path(connect)
-    if path.is_dir():
-        path /= FILE_NAME
     try:
+        if path.is_dir():
+            path /= FILE_NAME
         content = json.loads(path.read_text(encoding="utf-8"))
         endpoint, run_id = str(content["endpoint"]), str(content["run_id"])
         f"{endpoint}{run_id}".encode()  # raises UnicodeEncodeError for a lone surrogate
@@ -202,9 +200,11 @@ def _check_local(endpoint: str, machine: str, source: Path) -> None:
 
 
 def _checked(endpoint: str, source: str) -> str:
-    host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")
-    named = endpoint.startswith(SCHEME) and host.isprintable() and host.split() == [host]
-    if not (named and port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
+    host, _, port = endpoint.removeprefix(TCP).rpartition(":")
+    named = endpoint.startswith(TCP) and host.isprintable() and host.split() == [host]
+    if not (
+        named and len(port) < 6 and port.isascii() and port.isdecimal() and 0 < int(port) < 65536
+    ):
         raise RunError(
             f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port, with a port "
             "from 1 to 65535"

@@ -181,6 +181,12 @@ def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=reason):
             keys_of(tmp_path, **settings)
+    (tmp_path / "audit.jsonl").rename(tmp_path / "aside")
+    (tmp_path / "audit.jsonl").mkdir()  # what cannot be written there is no reason to refuse
+    keys_of(tmp_path, add="bob", out=str(tmp_path / "bob.json"))
+    keys_of(tmp_path, revoke="bob")
+    (tmp_path / "audit.jsonl").rmdir()
+    (tmp_path / "aside").rename(tmp_path / "audit.jsonl")
     assert keys_of(tmp_path, revoke="alice") == ["the key of alice is revoked"]
     assert run_keys(file) == made
     log = [json.loads(line) for line in (tmp_path / "audit.jsonl").read_text().splitlines()]

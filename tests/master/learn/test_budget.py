@@ -30,6 +30,8 @@ USED = [
     ({"max_episodes": 100}, (0.0, 50, 0), 0.5, None),
     ({"max_hours": 0.5}, (1799.0, 0, 10**9), 1799 / 1800, None),
     ({"max_hours": 0.5}, (1800.0, 0, 0), 1.0, "max_hours=0.5"),
+    ({"max_hours": 1}, (3600.0, 0, 0), 1.0, "max_hours=1"),
+    ({"max_hours": 1 / 3}, (1200.0, 0, 0), 1.0, f"max_hours={1 / 3!r}"),  # resume=auto compares it
     ({"max_hours": 1, "max_updates": 100}, (900.0, 0, 10), 0.25, None),
     ({"max_hours": 1, "max_updates": 100}, (900.0, 0, 30), 0.3, None),
 ]
@@ -54,7 +56,7 @@ def test_episodes_are_taken_up_to_the_bound(bound: int, episodes: int, takes: bo
 
 
 def test_rates_over_a_window() -> None:
-    rates = Rates(window_s=10.0)
+    rates = Rates()
     assert (rates.transitions_per_s(), rates.updates_per_s(), rates.left_s()) == (0.0, 0.0, None)
     # Slow for 20 s, then ten times as fast: the slow part leaves the window. It learns for a fifth.
     for second in range(21):

@@ -251,3 +251,34 @@ def test_what_cannot_be_shown_and_a_reader_that_goes_away_end_nothing(
         os.close(ours)
         _, errors = process.communicate("go on\n", timeout=LIMIT_S)
     assert (process.returncode, errors) == (0, f"{terminal}\n")
+
+
+FULL = """
+import resource, sys
+from master.watch.console import sturdy_console
+console, (_, most) = sturdy_console(sys.stdout), resource.getrlimit(resource.RLIMIT_FSIZE)
+console.print("before")
+resource.setrlimit(resource.RLIMIT_FSIZE, (7, most))
+for _ in range(3):
+    console.print("x" * 20_000, highlight=False)
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+console.print("after")
+resource.setrlimit(resource.RLIMIT_FSIZE, (7, most))
+console.print("at the end")
+"""
+
+
+@pytest.mark.cluster
+def test_what_a_full_disk_does_not_take_is_lost_and_the_rest_goes_on(tmp_path: Path) -> None:
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    with (tmp_path / "log").open("wb") as log:
+        told = subprocess.run(
+            [sys.executable, "-c", FULL],
+            env=buffered,
+            stdout=log,
+            stderr=subprocess.PIPE,
+            timeout=LIMIT_S,
+            check=False,
+        )
+    assert (told.returncode, told.stderr) == (0, b"")
+    assert (tmp_path / "log").read_text() == "before\nafter\n"

@@ -1,6 +1,7 @@
 """The client with a real hub, over losses and stops, and with a master that says odd things."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -163,8 +164,9 @@ def test_a_batch_out_of_bounds_is_not_sent(stage: Stage) -> None:
     with joined(stage) as client:
         bad = episodes()
         bad.rewards[0, 0] = np.nan
-        with pytest.raises(WireError, match=r"rewards holds nan at \[0, 0\]"):
+        with pytest.raises(WireError, match=r"rewards holds nan at \[0, 0\]") as refused:
             client.send(bad, 1)
+        assert refused.value.status == 1  # if it ends the worker, another is started
         assert client.send(episodes(), 1)
         stage.counted("batches")
         assert stage.batches()[0].sequence == 1
@@ -221,6 +223,22 @@ def test_what_came_out_of_turn_is_sent_again_with_all_before_it(master: StandIn)
         master.say(Reject(reason="batch 2: batch 1 must come first", sequence=2, final=False))
         master.until(client, lambda: numbers(master.heard) == [1, 2, 1, 2])
         assert client.counters["out_of_turn"] == 1
+
+
+def test_what_is_refused_again_and_again_is_sent_less_and_less_often(master: StandIn) -> None:
+    slow = replace(QUICK, resend_s=10.0, retry_s=1.0, heartbeat_s=1e6, silence_s=1e6)
+    full = Reject(reason="64 batches wait already", sequence=1, final=False)
+    with welcomed(master, slow) as client:
+        assert client.send(episodes(), 1)
+        sockets, now, sent = client._connection.sockets, time.monotonic(), list[int]()
+        assert sockets is not None
+        for second in range(32):
+            before = client.counters["resent"]
+            client._do_what_is_due(sockets, now + second)
+            if client.counters["resent"] > before or not second:
+                sent.append(second)
+                client._handle(full, now + second)
+        assert sent == [0, 1, 3, 7, 15, 23, 31]
 
 
 def test_what_is_refused_for_good_is_not_sent_again(master: StandIn) -> None:

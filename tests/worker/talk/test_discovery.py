@@ -1,5 +1,6 @@
 """Where the master is: an address, or the file that it writes."""
 
+import errno
 import json
 import re
 import socket
@@ -85,6 +86,7 @@ def test_a_host_that_is_unknown_says_where_its_name_comes_from(
         "udp://h:1",
         "tcp://h",
         "tcp://h:65536",
+        pytest.param(f"tcp://h:{'1' * 5000}", id="more digits than Python reads"),
         "tcp://h:x",
         "tcp://",
         "tcp://a b:1",
@@ -161,6 +163,17 @@ def test_the_settings_of_the_run_stand_in_the_file(tmp_path: Path) -> None:
     path.write_text(json.dumps(content | {"settings": 3}))
     with pytest.raises(RunError, match=r"settings must be a map"):
         find_master(str(path))
+
+
+def test_a_disk_that_fails_is_told_as_a_file_that_cannot_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(_: Path) -> bool:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(Path, "is_dir", fails)
+    with pytest.raises(RunError, match=r"is no connection file \(Input/output error"):
+        find_master(str(tmp_path))
 
 
 def test_a_file_that_comes_late_is_waited_for(tmp_path: Path) -> None:
