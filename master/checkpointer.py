@@ -44,7 +44,7 @@ BETWEEN, MOST_BETWEEN_S = 9.0, 3600.0
 RETRY_S = 1.0
 KEPT = 2  # newest checkpoints: the second is used if the newest is damaged
 WAIT = "until then nothing is acknowledged, and workers keep what they played"
-MAKE_ROOM = f"make room there; {WAIT}"
+MAKE_ROOM = f"make room there or mend the disk; {WAIT}"
 PUT_BACK = f"put it back, or make an empty folder there; {WAIT}"
 AT_ONCE = "a new segment is begun and a checkpoint written at once, so that nothing is lost"
 JOURNAL = "journal"
@@ -151,11 +151,9 @@ class Checkpointer:
     def _failed(self, error: RunError | OSError) -> None:
         self.failing, self.homeless = True, isinstance(error, FolderError)
         if self._tell.due():
-            remedies: dict[type, str] = {
-                JournalError: f": {MAKE_ROOM}",
-                FolderError: f": {PUT_BACK}",
-            }
-            log.warning("%s%s", error, remedies.get(type(error), ""))
+            remedy = f": {PUT_BACK if self.homeless else MAKE_ROOM}"
+            # DiskError has its own remedy.
+            log.warning("%s%s", error, "" if isinstance(error, DiskError) else remedy)
 
     def _worked(self) -> None:
         if self.failing:

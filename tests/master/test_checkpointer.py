@@ -113,7 +113,7 @@ def test_a_disk_whose_files_cannot_be_looked_at_is_waited_for(
         failing.setattr(Path, "is_dir", fails)
         assert not stage.keep(2)
         stage.checkpointer.tick()
-    assert stage.told == ["[Errno 5] Input/output error"]
+    assert stage.told == [f"[Errno 5] Input/output error: {MAKE_ROOM}"]
     assert stage.keep(2)
 
 
