@@ -226,8 +226,9 @@ class Reporter:
 
     def scored(self, scores: Scores) -> None:
         """Add an evaluation of earlier weights to the record, the curves and the picture."""
-        self._record.score(scores.scalars, scores.weights_version)
-        self._latest = scores
+        if self._record.scored_version != self._trainer.updates:  # a slower evaluator's stay out
+            self._record.score(scores.scalars, scores.weights_version)
+            self._latest = scores
         values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
         updates = scores.weights_version
         sent = self._published.get(updates, self._now())

@@ -279,8 +279,9 @@ def test_the_final_weights_are_waited_for_and_reported(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(2), roles=["player", "evaluator"])
     made = loop(tmp_path, MADE, hub, max_updates=4)
     reason = made.run()
-    # First the score of older weights comes, which is not the one that counts.
-    hub.script.extend([[scores(MADE, 1, reward=0.1)], [], [scores(MADE, 4, reward=0.9)]])
+    # Scores of older weights come before and behind those that count.
+    older = scores(MADE, 1, reward=0.1)
+    hub.script.extend([[older], [], [scores(MADE, 4, reward=0.9), older]])
     result = make_result(
         made.finish(launched=False), MADE.task.scores, made.guard.trainer.facts(), 7, reason
     )
