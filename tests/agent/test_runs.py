@@ -62,7 +62,7 @@ def spoil(path: Path) -> None:
         (lambda run: run.rename(run.with_name("elsewhere")), "no run folder"),
         (lambda run: (run / "config.yaml").unlink(), "is this a run folder"),
         (lambda run: (run / "config.yaml").write_text("a: [1"), "not valid YAML"),
-        (lambda run: (run / "config.yaml").write_text("[" * 9999), "is no file of sett"),
+        (lambda run: (run / "config.yaml").write_text("[" * 9999), "is too large for sett"),
         (lambda run: (run / "config.yaml").write_text("- 1"), "holds no settings"),
         (lambda run: (run / "config.yaml").write_text("tokens: {}"), "names no task: .*CHANGELOG"),
         (lambda run: (run / "config.yaml").write_text(KINDS), "no section tokens, sim"),

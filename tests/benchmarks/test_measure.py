@@ -131,7 +131,7 @@ def test_a_match_that_has_its_rows_is_not_run_again(
         Match("FetchPush-v4", 0, 1.0, "push", 0),
     )
     monkeypatch.setattr(fetch, "find_spec", lambda name: None if name == "panda_gym" else name)
-    with pytest.raises(ModuleNotFoundError, match="panda_gym is missing: pip install"):
+    with pytest.raises(ModuleNotFoundError, match="panda_gym is missing: install"):
         measure_fetch([one, Match("PandaPush-v3", 0, 1.0, "goal", 0)], rows)
     assert len(measure_fetch([one], rows)) == 4
     table = measure_fetch([one, two, other], rows)

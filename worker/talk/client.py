@@ -105,7 +105,7 @@ class Client:
         # Whether the master has told this process to end, and its reason.
         self._dismissed, self._dismissal = False, ""
         self._hello_at = self._heartbeat_at = self._resend_at = 0.0
-        self._patience_s = self._timing.resend_s
+        self._patience = 1.0  # doubles with each resend
 
     def __enter__(self) -> Self:
         return self
@@ -304,8 +304,8 @@ class Client:
         A master that is only slow already has the batches. Batches that were really lost are sent
         again at once after a WELCOME, and soon after a REJECT.
         """
-        self._patience_s = min(2.0 * self._patience_s, MOST_PATIENCE * self._timing.resend_s)
-        self._resend_at = now + self._patience_s
+        self._patience = min(2.0 * self._patience, MOST_PATIENCE)
+        self._resend_at = now + self._patience * self._timing.resend_s
         self._post_all()
 
     def _post_all(self) -> None:
@@ -315,8 +315,8 @@ class Client:
 
     def _be_patient(self, now: float) -> None:
         """Restart the resend timer with its shortest wait."""
-        self._patience_s = self._timing.resend_s
-        self._resend_at = now + self._patience_s
+        self._patience = 1.0
+        self._resend_at = now + self._timing.resend_s
 
     def _want_weights(self) -> None:
         self._post(WantWeights(self.newest.epoch, self.newest.version).encode())
@@ -412,8 +412,7 @@ class Client:
             # The batch before was refused by a master that was killed: HELLO tells what is first.
             self.joined, self._hello_at = False, now + self._timing.retry_s
         else:
-            wait_s = self._timing.retry_s * self._patience_s / self._timing.resend_s
-            self._resend_at = min(self._resend_at, now + wait_s)
+            self._resend_at = min(self._resend_at, now + self._patience * self._timing.retry_s)
 
     def _warn(self, event: str, text: str, reason: object) -> None:
         log.warning(text, self._connection.place, reason, extra={"event": event})
