@@ -165,7 +165,8 @@ class Episodes:
     def lengths(self) -> Ints:
         """Steps (E,) until each episode first terminated; T if it did not."""
         ended = self.terminated.astype(bool)
-        return np.where(ended.any(1), ended.argmax(1) + 1, self.steps)
+        counts: Ints = np.where(ended.any(1), ended.argmax(1) + 1, ended.shape[1])
+        return counts
 
     def at(self, rows: Any) -> "Episodes":
         """The selected episodes; `rows`: an index array, a slice or a mask."""

@@ -44,6 +44,8 @@ class RateLimiter:
                 "agent.updates_per_transition must be positive and finite, got "
                 f"{updates_per_transition}: no update would ever be made"
             )
+        if lag_updates < 1:  # learner and workers would wait for each other for ever
+            raise ConfigError(f"the lag must be at least 1 update, got {lag_updates}")
         self._rate, self._starts, self._limit = updates_per_transition, learning_starts, lag_updates
         self.transitions = 0
         self.updates = 0

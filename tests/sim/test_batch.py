@@ -125,11 +125,8 @@ def test_no_corner_leaves_the_bound(actions_per_token: int) -> None:
     away = np.sign(env.layout.poses(env.corners)[:, 0])
     for _ in range(env.horizon):
         env.step(away)
-    assert (
-        0.9 * env.spec.field("corners").high
-        < np.abs(env.corners).max()
-        <= env.spec.field("corners").high
-    )
+    bound = env.spec.field("corners").high
+    assert 0.9 * bound < np.abs(env.corners).max() <= bound
 
 
 def test_actions_beyond_the_box_count_as_its_bound_in_either_precision() -> None:

@@ -28,7 +28,7 @@ from tangram_agent.flat.replay import EpisodeReplay
 from tangram_agent.nets.weights import to_arrays
 from tangram_core.agent import Streams, Tensors
 from tangram_core.arrays import Ints
-from tangram_core.spec import Array, Arrays, Episodes
+from tangram_core.spec import TERMINATED, Array, Arrays, Episodes
 from tangram_tasks.push.places import ways_of
 from tangram_tasks.push.task import Push
 
@@ -106,7 +106,8 @@ class PushReplay(EpisodeReplay):
 
     def _look(self, slots: Ints) -> None:
         """Store the lengths of new episodes."""
-        self._lengths[slots] = Episodes(self.arrays).at(slots).lengths
+        ends = {TERMINATED: self.arrays[TERMINATED][slots]}
+        self._lengths[slots] = Episodes(ends).lengths
 
     @cached_property
     def _lengths(self) -> Ints:

@@ -79,13 +79,19 @@ def test_somebody_may_always_move_and_nobody_runs_ahead(
 
 
 @pytest.mark.parametrize(
-    "rate",
-    [0.0, math.nan, math.inf],
+    ("rate", "limit", "reason"),
+    [
+        (0.1, 0, "the lag must be at least 1 update, got 0"),
+        *(
+            (rate, 1, f"agent.updates_per_transition must be positive and finite, got {rate}: no")
+            for rate in (0.0, math.nan, math.inf)
+        ),
+    ],
 )
-def test_settings_that_would_deadlock(rate: float) -> None:
-    reason = f"agent.updates_per_transition must be positive and finite, got {rate}: no"
-    with pytest.raises(ConfigError, match=reason):
-        RateLimiter(rate, 1)
+def test_settings_that_would_deadlock(rate: float, limit: int, reason: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        RateLimiter(rate, 1, limit)
+    assert str(caught.value).startswith(reason)
 
 
 def test_a_restore_takes_counters_but_not_the_policy() -> None:

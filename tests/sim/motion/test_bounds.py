@@ -101,8 +101,5 @@ def test_a_token_alone_goes_as_far_as_the_bound_says() -> None:
     with closing(begun(actions_per_token=3)) as env:
         for _ in range(3):
             env.step(np.ones((3, 3)))
-        assert (
-            0.9 * env.spec.field("corners").high
-            < np.abs(env.corners).max()
-            <= env.spec.field("corners").high
-        )
+        bound = env.spec.field("corners").high
+        assert 0.9 * bound < np.abs(env.corners).max() <= bound
