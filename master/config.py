@@ -37,10 +37,11 @@ def check_compiling(service: ServiceConfig) -> None:
     if not service.compile:
         return
     named = os.environ.get("CXX")
-    if not any(shutil.which(name) for name in ([named] if named else COMPILERS)):
+    sought, remedy = ((named,), "unset CXX") if named else (COMPILERS, "install g++")
+    if not any(shutil.which(name) for name in sought):
         raise ConfigError(
-            f"service.compile=true needs a C++ compiler, and {named or ' or '.join(COMPILERS)} is "
-            "not found: install g++, or set service.compile=false"
+            f"service.compile=true needs a C++ compiler, and {' or '.join(sought)} is not found: "
+            f"{remedy}, or set service.compile=false"
         )
 
 

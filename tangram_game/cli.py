@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def evaluate() -> int:
-    """tangram-eval: scores a finished run."""
+    """tangram-eval: scores a run."""
     return entry("eval", _evaluate)
 
 
 def play() -> int:
-    """tangram-play: draws a finished run at play."""
+    """tangram-play: draws a run at play."""
     return entry("play", _play)
 
 

@@ -65,7 +65,7 @@ def _check_kept(out: str, name: str, source: str | None) -> None:
 
 @dataclass(frozen=True)
 class EvalConfig(Settings):
-    """Settings of tangram-eval, which scores a finished run on fixed tests or puzzles.
+    """Settings of tangram-eval, which scores a run on fixed tests or puzzles.
 
     Attributes:
         changes: settings of task, sim, reward and agent that override those of the run.

@@ -1,4 +1,4 @@
-"""tangram-eval: scores of a finished run on the fixed test set, or on puzzles."""
+"""tangram-eval: scores of a run on the fixed test set, or on puzzles."""
 
 import json
 import time

@@ -1,4 +1,4 @@
-"""tangram-play: episodes of a finished run as an animation, a picture or data."""
+"""tangram-play: episodes of a run as an animation, a picture or data."""
 
 import json
 import math

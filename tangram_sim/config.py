@@ -83,7 +83,7 @@ class SimConfig(Settings, section="sim"):
 
     @property
     def looks(self) -> bool:
-        """Whether agents see only the camera's pictures."""
+        """Whether agents see only tokens that are found in pictures."""
         return self.observe == "pictures"
 
     @property

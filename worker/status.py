@@ -74,7 +74,7 @@ def ask_status(
     """The status of a run; RunError if `connect` is no address, TangramError without an answer."""
     address = find_master(connect)
     if address is None:
-        raise TangramError(f"no connection file at {connect}: {_nobody(Path(connect) / CONFIG)}")
+        raise TangramError(f"no connection file at {connect}: {_nobody(Path(connect))}")
     unknown_host = host_error(address.endpoint, connect)
     if unknown_host:
         raise TangramError(unknown_host)
@@ -100,10 +100,11 @@ def ask_status(
     )
 
 
-def _nobody(config: Path) -> str:
+def _nobody(connect: Path) -> str:
     """Why there is no connection file: a master writes its config first, when it starts."""
+    config = (connect.parent if connect.suffix == ".json" else connect) / CONFIG
     if not config.is_file():
-        return "no master runs there"
+        return "correct connect, or start a master"
     ago = duration(max(0.0, time.time() - config.stat().st_mtime))
     return f"its master was started {ago} ago and is still starting, or failed to: ask again"
 

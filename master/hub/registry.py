@@ -82,7 +82,7 @@ class Peer:
     _patience_s: float = WEIGHTS_AGAIN_S
 
     def may_have(self, version: int, shown: int) -> bool:
-        """Whether to send weights `version` to a peer that says it has `shown`; counts as sent.
+        """Whether to send weights `version` to a peer that has version `shown`; if so, notes it.
 
         Requests are limited because messages to a peer that does not read stay in memory here.
         """

@@ -308,7 +308,7 @@ class Clock:
         self._begun_s = self._last_s = time.monotonic()
 
     def advance(self, training: bool) -> None:
-        """Add the time since the last call to `loop_s`, and if `training` to `train_s`, too."""
+        """Add the time since the last call: to `loop_s`; if `training`, to `train_s`, too."""
         now_s = time.monotonic()
         self.record.loop_s += now_s - self._last_s
         if training:

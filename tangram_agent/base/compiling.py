@@ -183,7 +183,7 @@ class Whole:
                     found = call(own, rates)
             except RuntimeError as error:
                 why = str(error).partition("\n")[0]
-                log.warning("updates are slow, as no CUDA graph can record them: %s", why)
+                log.warning("updates are slow: losses() cannot be a CUDA graph: %s", why)
                 return _filled(call)
 
         def replay(tensors: list[Tensor], values: list[float], _: Any = call) -> Tensor:

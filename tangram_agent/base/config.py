@@ -133,7 +133,7 @@ class LearningConfig(Settings, section="agent"):
         part=LEARNING,
     )
     uniform_share: float = setting(
-        0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
+        0.2, "share of random exploring actions", low=0, high=1, part=LEARNING
     )
 
     def __post_init__(self) -> None:

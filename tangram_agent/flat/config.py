@@ -28,9 +28,7 @@ class EpisodeConfig(Settings, section="agent"):
         part=LEARNING,
     )
     gamma: float = setting(0.95, "discount factor", low=0, high=0.99999, part=LEARNING)
-    polyak: float = setting(
-        0.99, "share of its weights that a target network keeps", low=0, high=1, part=LEARNING
-    )
+    polyak: float = setting(0.99, "rho of the target networks, Eq. 4", low=0, high=1, part=LEARNING)
     relabel_share: float = setting(
         0.8,
         "share of a batch whose goal is replaced by one that the episode achieved later; 0: no "
@@ -40,7 +38,7 @@ class EpisodeConfig(Settings, section="agent"):
         part=LEARNING,
     )
     uniform_share: float = setting(
-        0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
+        0.2, "share of random exploring actions", low=0, high=1, part=LEARNING
     )
 
     def __post_init__(self) -> None:

@@ -129,7 +129,7 @@ def read_code(setting: str, given: str, path: Path, sha256: str | None = None) -
     if sha256 not in (None, found):
         raise ConfigError(
             f"{setting}={given}: '{path}' has sha256 {found}, and the settings of the run want "
-            f"{sha256}: name the file that the run began with, or begin a new run"
+            f"{sha256}: name the copy in the run's folder, or begin a new run"
         )
     return source, found
 

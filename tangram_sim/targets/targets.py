@@ -98,14 +98,15 @@ def _check_names(layout: Layout, observe: str) -> None:
         turn = _turn_of(one, other)
         if one.name == other.name:
             if turn is None or turn[1] or abs(turn[0]) > _NO_TURN:
+                remedy = "different names" if turn is None else "the same corners"
                 raise ConfigError(
                     f"sim.observe={observe} needs equal corners for tokens of one name, and two "
-                    f"tokens {one.name} differ: give them different names"
+                    f"tokens {one.name} differ: give them {remedy}"
                 )
         elif turn is not None:
             raise ConfigError(
                 f"sim.observe={observe} cannot tell {one.name} from {other.name}, which may look "
-                "alike: give equal tokens one name, or set sim.observe=corners"
+                "alike: leave one out, give own equal tokens one name, or set sim.observe=corners"
             )
 
 

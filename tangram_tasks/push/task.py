@@ -42,7 +42,7 @@ class PushConfig(Settings, section="task"):
     )
     fewer: tuple[float, ...] = setting(
         (),
-        "in training, weights of episodes with 1, 2, 3, ... tokens; []: always task.count",
+        "in training, odds of episodes with 1, 2, 3, ... tokens; []: always task.count",
         low=0,
         part=LEARNING,
     )
@@ -52,18 +52,22 @@ class PushConfig(Settings, section="task"):
         "angle: names, or train or test for a whole split; []: random layouts of touching tokens, "
         "or figures of train",
     )
-    within: float = setting(0.03, "distance within which a token is in place", low=1e-4, high=1)
+    within: float = setting(
+        0.03, "distance within which a token is in place", low=1e-4, high=1, unit="arena units"
+    )
     turned: float = setting(
         0.1, "turn within which a token is in place", low=1e-4, high=4, unit="rad"
     )
-    finger: float = setting(0.04, "radius of the finger", low=0.005, high=0.2)
+    finger: float = setting(0.04, "radius of the finger", low=0.005, high=0.2, unit="arena units")
     hand: str = setting(
         "finger",
         "what pushes: finger, a finger that reaches every place; panda, a finger on a robot's arm, "
         "as far as its joints allow",
         choices=("finger", "panda"),
     )
-    longest: float = setting(0.5, "length of the longest push", low=0.05, high=1)
+    longest: float = setting(
+        0.5, "length of the longest push", low=0.05, high=1, unit="arena units"
+    )
     pixels: int = setting(
         0,
         "side of the pictures in which tokens are found, from 16; 0: agents see exact corners",
@@ -78,8 +82,8 @@ class PushConfig(Settings, section="task"):
     )
     spread: tuple[float, ...] = setting(
         (0.9, 2.0),
-        "range of the squared lever of the table's friction, in squared radii of gyration of the "
-        "token: 0.9 for even pressure, 2 and more if the corners carry the token",
+        "range of (friction torque / force)^2, in squared radii of gyration of the token: 0.9 for "
+        "even pressure, 2 and more if the corners carry it",
         low=0.1,
         high=5,
     )
@@ -205,7 +209,7 @@ class Push(Task):
         fewer = self.config.fewer
         if not plays and fewer and (len(fewer) > self.count or not sum(fewer)):
             raise ConfigError(
-                f"task.fewer={told(fewer)} must have at most {self.count} weights, for 1, 2, ... "
+                f"task.fewer={told(fewer)} must have at most {self.count} odds, for 1, 2, ... "
                 f"tokens, with one above 0: write it as {told((1,) * self.count)}"
             )
         for seed in range(DRAWS):

@@ -204,12 +204,12 @@ def test_one_of_two_tokens_is_half_of_the_reward() -> None:
         assert env.step(away).rewards.tolist() == [-0.5]
 
 
-@pytest.mark.parametrize("weights", [(1.0, 1.0), (0.0,)])
-def test_weights_of_no_tokens_are_refused_where_it_learns(weights: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("odds", [(1.0, 1.0), (0.0,)])
+def test_odds_of_no_tokens_are_refused_where_it_learns(odds: tuple[float, ...]) -> None:
     with pytest.raises(
-        ConfigError, match="task.fewer=.* must have at most 1 weights, for 1, 2, ... tokens, with"
+        ConfigError, match="task.fewer=.* must have at most 1 odds, for 1, 2, ... tokens, with"
     ):
-        replace(SQUARE, config=PushConfig(fewer=weights)).check(plays=False)
+        replace(SQUARE, config=PushConfig(fewer=odds)).check(plays=False)
 
 
 def test_it_learns_from_fewer_tokens_too_and_is_tested_with_all() -> None:

@@ -138,8 +138,8 @@ def host_error(endpoint: str, connect: str) -> str:
     if not said or as_address(connect) is not None:
         return said and f"{said}: check the name in connect="
     return (
-        f"{said}: {connect} has this name from the master's service.host; start the master with a "
-        "name or an address that this machine knows"
+        f"{said}: {connect} has this name from its master; start it with service.host= a name or "
+        "an address that this machine knows"
     )
 
 

@@ -18,8 +18,8 @@ class PushingConfig(EpisodeConfig, section="agent"):
     width: int = setting(128, "width of all layers", low=8, high=4096, part=NETWORK)
     looked_at: int = setting(
         96,
-        "pushes of each token that the critic values for each action while it learns; four times "
-        "as many afterwards",
+        "pushes of each token that the critic values for an action while exploring; else four "
+        "times as many, up to 1,024",
         low=2,
         high=1024,
     )

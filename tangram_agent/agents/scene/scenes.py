@@ -12,7 +12,7 @@ from tangram_tasks.played import closed
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
-    """M whole scenes.
+    """M whole scenes of K tokens with V corners in all.
 
     Attributes:
         corners: (M, V, 2) of the tokens.

@@ -1,4 +1,4 @@
-"""Runs all attacks of the security review on real trainings, and reports the outcome."""
+"""Runs all known attacks on real trainings, and reports the outcome."""
 
 import resource
 import signal
@@ -70,7 +70,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
         folder: folder for the runs, without any runs yet.
 
     Returns:
-        0 if every attack held and the score is no worse, else 1.
+        0 if no attack did harm and the score is no worse, else 1.
     """
     begun = time.monotonic()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

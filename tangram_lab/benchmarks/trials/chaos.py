@@ -290,8 +290,8 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
         folder: folder for the two runs, without any runs yet.
 
     Returns:
-        0 if the run recovered from every fault, no episode was lost or doubled and no process was
-        left over, else 1.
+        0 if the run recovered from every fault, lost or doubled no episode, left no process and had
+        no error, else 1.
     """
     disturbed, straight = folder / "disturbed", folder / "straight"
     port = free_port()

@@ -42,7 +42,7 @@ from worker.status import ask_status
 from worker.talk.discovery import find_master
 
 Seen = tuple[bool, str]  # whether the training held, and what was observed
-# Row of the security review, description, amount, and the function that attacks.
+# Kind of attack, description, amount, and the function that attacks.
 Attack = tuple[str, str, str, Callable[[Any], Seen]]
 Rows = list[dict[str, Any]]
 OFTEN = "service.checkpoint_minutes=0.05"

@@ -187,9 +187,9 @@ def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(ConfigError, match="compile=true changes nothing with agent.kind=outline"):
         outline_setup().agent.check_training(compiled=True)  # before there is a folder of the run
     monkeypatch.setenv("CXX", "no-such-compiler")
-    with pytest.raises(ConfigError, match="no-such-compiler is not found: install g"):
+    with pytest.raises(ConfigError, match="no-such-compiler is not found: unset CXX"):
         check_compiling(wanted)
     monkeypatch.delenv("CXX")
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(ConfigError, match=r"g\+\+ or clang\+\+ is not found"):
+    with pytest.raises(ConfigError, match=r"g\+\+ or clang\+\+ is not found: install g"):
         check_compiling(wanted)

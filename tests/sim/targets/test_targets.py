@@ -147,13 +147,18 @@ def test_touching_is_connected_and_figures_in_turns() -> None:
         (
             layout_of("parallelogram", "parallelogram_mirrored"),
             SEEN,
-            "cannot tell parallelogram from parallelogram_mirrored, which may look alike: give ",
+            "cannot tell parallelogram from parallelogram_mirrored, which may look alike: leave ",
         ),
         (layout_of("square", BOX), SEEN, "cannot tell square from box, which may look alike: "),
         (
             layout_of(BOX, BOX | {"corners": [[0, 0], [1, 0], [1, 2], [0, 2]]}),
             SEEN,
-            "needs equal corners for tokens of one name, and two tokens box differ: give them ",
+            "needs equal corners for tokens of one name, and two tokens box differ: give them diff",
+        ),
+        (
+            layout_of(BOX, BOX | {"corners": [[0, 0], [0.25, 0.25], [0, 0.5], [-0.25, 0.25]]}),
+            SEEN,
+            "needs equal corners for tokens of one name, and two tokens box differ: give them the ",
         ),
         (
             layout_of("square"),

@@ -76,7 +76,7 @@ def test_a_host_that_is_unknown_says_where_its_name_comes_from(
     endpoint = "tcp://learner.lan:1"
     assert host_error(endpoint, "learner.lan:1") == "no such host: check the name in connect="
     assert host_error(endpoint, "runs/zz").startswith(
-        "no such host: runs/zz has this name from the master's service.host; start the master with"
+        "no such host: runs/zz has this name from its master; start it with service.host= a name"
     )
 
 
