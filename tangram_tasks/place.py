@@ -17,7 +17,7 @@ from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.episodes import spec_of
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
-from tangram_sim.motion.actions import action_size, goal_rows, horizon
+from tangram_sim.motion.actions import goal_rows
 from tangram_sim.rewards import RewardFn, check_reward, make_reward, pinned, reward_identity
 from tangram_sim.targets.targets import check_targets
 from tangram_sim.world.world import check_room, check_shown, check_world
@@ -91,19 +91,9 @@ class Place(Task):
         return self.reward_of(achieved.astype(np.float64), desired.astype(np.float64))
 
     @property
-    def horizon(self) -> int:
-        """Number of actions in an episode (T)."""
-        return horizon(self.layout.tokens, self.sim)
-
-    @property
     def goal_rows(self) -> int:
         """Number of a target's corners that agents see (G)."""
         return goal_rows(self.layout, self.sim)
-
-    @property
-    def action_size(self) -> int:
-        """Size of an action (A): token (if several), flip (if allowed) and 3 velocities."""
-        return action_size(self.layout.tokens, self.sim)
 
     @cached_property
     def spec(self) -> EpisodeSpec:

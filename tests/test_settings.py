@@ -23,7 +23,7 @@ from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import declared_fields
 from tangram_core.setup import Setup, make_setup
 from tests.sim.builders import SEVEN
-from worker.play.rollout import Rollout, exploring
+from worker.play.rollout import Rollout
 from worker.play.session import Acting
 
 pytestmark = pytest.mark.fast
@@ -205,7 +205,7 @@ def steps_of(setup: Setup) -> Iterator[str]:
         rollout = Rollout(env, setup.spec, 0, "player", 0, 0)
         for turn in range(TURNS):
             acting.follow(trainer.weights())
-            played = rollout.play(exploring(acting.actor))
+            played = rollout.play(acting.actor.act)
             yield digest(*(played.arrays[name] for name in sorted(played.arrays)))
             trainer.insert(played)
             while trainer.rate_limiter.may_update():

@@ -82,7 +82,7 @@ class Ddpg(TokenLearner):
             compiled: whether an update is compiled as a whole, see `Whole`.
         """
         self.task, self.config, self.polyak = task, config, config.polyak
-        self.bootstraps = config.gamma > 0.0 and task.horizon > 1
+        self.bootstraps = config.gamma > 0.0 and task.spec.horizon > 1
         self.relabels = config.hindsight
         self.actor, self.critic, playing = networks
         learned = {"actor": self.actor, "critic": self.critic}
@@ -90,7 +90,7 @@ class Ddpg(TokenLearner):
         given = config, learned, playing, seed, device
         super().__init__(*given, targets=targets, compiled=compiled)
         layout = task.layout
-        size = layout.corner_count, layout.tokens, task.action_size
+        size = layout.corner_count, layout.tokens, task.spec.action_size
         self.replay = ReplayBuffer(config.replay_capacity, *size)
 
     @abstractmethod

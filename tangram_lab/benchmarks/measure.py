@@ -51,23 +51,6 @@ class Row:
     held: bool | None = None
 
 
-@dataclass(frozen=True)
-class Bound:
-    """Required bounds of a number: at least `least`, at most `most`."""
-
-    least: float | None = None
-    most: float | None = None
-
-    def holds(self, value: float) -> bool:
-        """Whether a value is within the bounds."""
-        low = self.least is None or value >= self.least
-        return low and (self.most is None or value <= self.most)
-
-    def __str__(self) -> str:
-        parts = [f">= {self.least:g}"] if self.least is not None else []
-        return ", ".join(parts + ([f"<= {self.most:g}"] if self.most is not None else []))
-
-
 def rate(work: Work, span_s: float) -> float:
     """Units of work per second, measured over at least `span_s` seconds."""
     begin, count = time.perf_counter(), 0.0
@@ -87,64 +70,37 @@ def rates(works: Mapping[str, Work], runs: int, span_s: float = SPAN_S) -> dict[
     return found
 
 
-def compare(
+def row_of(
     labels: tuple[str, str, str],
-    ours: Work,
-    theirs: tuple[str, Work],
-    runs: int,
-    bound: Bound | None = None,
+    ours: Sequence[float],
+    against: str = "",
+    theirs: Sequence[float] | None = None,
+    least: float | None = None,
 ) -> Row:
-    """Measure two implementations in turns; print and return the row.
+    """Make and print the row of one series of numbers, or of two that were measured in turns.
 
     Args:
         labels: stage, case and unit.
-        ours: our implementation.
-        theirs: name and implementation of the rival.
-        runs: number of measurements of each.
-        bound: required bound of ours / theirs; None: no bound.
+        ours: our numbers.
+        against: name of the rival; empty without one.
+        theirs: numbers of the rival, as many as `ours`; None without one.
+        least: smallest value of ours / theirs, or without a rival of `ours`; None: no bound.
     """
-    found = rates({"ours": ours, "theirs": theirs[1]}, runs)
-    return compared(labels, found["ours"], theirs[0], found["theirs"], bound)
-
-
-def compared(
-    labels: tuple[str, str, str],
-    ours: Sequence[float],
-    against: str,
-    theirs: Sequence[float],
-    bound: Bound | None = None,
-) -> Row:
-    """Make and print the row of two series of numbers that were measured in turns."""
-    ratios = [mine / other for mine, other in zip(ours, theirs, strict=True)]
-    middle = statistics.median(ratios)
+    found, ratio = ours, None
+    if theirs is not None:
+        found = [mine / other for mine, other in zip(ours, theirs, strict=True)]
+        ratio = statistics.median(found)
     return told(
         Row(
             *labels,
             ours=statistics.median(ours),
             against=against,
-            theirs=statistics.median(theirs),
-            ratio=middle,
-            least=min(ratios),
-            most=max(ratios),
-            target="" if bound is None else str(bound),
-            held=None if bound is None else bound.holds(middle),
-        )
-    )
-
-
-def single(
-    labels: tuple[str, str, str], values: Sequence[float], bound: Bound | None = None
-) -> Row:
-    """Make and print the row of one series of numbers without a rival."""
-    middle = statistics.median(values)
-    return told(
-        Row(
-            *labels,
-            ours=middle,
-            least=min(values),
-            most=max(values),
-            target="" if bound is None else str(bound),
-            held=None if bound is None else bound.holds(middle),
+            theirs=None if theirs is None else statistics.median(theirs),
+            ratio=ratio,
+            least=min(found),
+            most=max(found),
+            target="" if least is None else f">= {least:g}",
+            held=None if least is None else statistics.median(found) >= least,
         )
     )
 

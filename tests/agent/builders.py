@@ -120,10 +120,10 @@ NAN = one_tensor("F32", [1], b"\xff" * 4)
 def random_episodes(made: Setup, count: int, seed: int = 0) -> Episodes:
     """Episodes of random poses and actions; poses do not follow from actions."""
     rng = np.random.default_rng(seed)
-    layout, steps = made.task.layout, made.task.horizon
+    layout, steps = made.task.layout, made.task.spec.horizon
     poses = rng.uniform([-0.7, -0.7, -3], [0.7, 0.7, 3], (count, steps + 2, layout.tokens, 3))
     corners = layout.corners(poses).astype(np.float32)
-    actions = rng.uniform(-1, 1, (count, steps, made.task.action_size))
+    actions = rng.uniform(-1, 1, (count, steps, made.task.spec.action_size))
     placed = np.zeros((count, steps + 1, layout.tokens), np.uint8)
     placed[:, -1] = 1
     return Episodes(
@@ -157,7 +157,7 @@ def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None 
     return Transitions(
         state=before,
         placed=np.zeros((count, layout.tokens), np.uint8),
-        action=rng.uniform(-1, 1, (count, made.task.action_size)).astype(np.float32),
+        action=rng.uniform(-1, 1, (count, made.task.spec.action_size)).astype(np.float32),
         reward=rng.uniform(-1, 1, count).astype(np.float32),
         next_state=after,
         next_placed=np.repeat(ends[:, None], layout.tokens, axis=1).astype(np.uint8),

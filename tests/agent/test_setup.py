@@ -148,7 +148,7 @@ def test_sizes_follow_from_tokens_and_actions(
 ) -> None:
     config = changed("tokens", shapes=shapes) | {"sim": {"actions_per_token": actions}}
     made = make_setup(config)
-    assert (made.task.horizon, made.task.action_size) == (horizon, action_size)
+    assert (made.task.spec.horizon, made.task.spec.action_size) == (horizon, action_size)
 
 
 @pytest.mark.parametrize(

@@ -10,4 +10,4 @@ pytestmark = pytest.mark.fast
 def test_several_tokens_are_a_valid_task() -> None:
     for count in range(1, 8):
         task = place(several(count))
-        assert task.layout.tokens == task.horizon == count
+        assert task.layout.tokens == task.spec.horizon == count

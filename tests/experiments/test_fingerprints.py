@@ -23,7 +23,7 @@ import torch
 from conf.cli import composed
 from master.learn.trainer import Trainer
 from tangram_core.setup import Setup, make_setup
-from worker.play.rollout import Rollout, exploring
+from worker.play.rollout import Rollout
 
 FILE = Path(__file__).parents[1] / "golden" / "fingerprints.json"
 UPDATES = 20
@@ -94,7 +94,7 @@ def fingerprint(setup: Setup, moved_by: int | None = None) -> dict[str, float]:
         rollout = Rollout(env, setup.spec, SEED, "player", 0, 0)
         while trainer.updates < UPDATES:
             actor.load(trainer.weights().tensors)
-            trainer.insert(rollout.play(exploring(actor), BATCH_EPISODES // ENVS))
+            trainer.insert(rollout.play(actor.act, BATCH_EPISODES // ENVS))
             while trainer.rate_limiter.may_update() and trainer.updates < UPDATES:
                 for name, loss in trainer.update(trainer.updates / UPDATES).items():
                     losses.setdefault(name, []).append(loss)

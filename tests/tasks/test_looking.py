@@ -15,7 +15,7 @@ from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.kinematics import KinematicWorld
 from tests.agent.builders import Policy
-from worker.play.rollout import Rollout, exploring
+from worker.play.rollout import Rollout
 
 pytestmark = pytest.mark.fast
 
@@ -35,7 +35,7 @@ def setup(*shapes: str, **sim: Any) -> Setup:
 
 def played(task: Setup, policy: Policy, groups: int = 2) -> Episodes:
     with closing(task.task.make(4)) as env:
-        return Rollout(env, task.spec, 0, "player", 0, 0).play(exploring(policy.actor), groups)
+        return Rollout(env, task.spec, 0, "player", 0, 0).play(policy.actor.act, groups)
 
 
 def at_random(task: Setup) -> Setup:

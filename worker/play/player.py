@@ -9,7 +9,7 @@ from tangram_core.spec import Episodes
 from tangram_core.wire.arrays import most_episodes
 from tangram_core.wire.messages import Go
 from worker.config import WorkerConfig
-from worker.play.rollout import Rollout, exploring, parts
+from worker.play.rollout import Rollout, parts
 from worker.play.session import Acting, Report, joined
 from worker.talk.client import Client
 
@@ -98,4 +98,4 @@ def _play(rollout: Rollout, acting: Acting, client: Client, groups: int) -> Epis
         client.poll()
         return not client.stopped
 
-    return rollout.play(exploring(acting.actor), groups, go_on)
+    return rollout.play(acting.actor.act, groups, go_on)

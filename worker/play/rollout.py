@@ -23,11 +23,6 @@ def greedy(actor: Actor) -> Chooser:
     return lambda seen, past, _: actor.act(seen, past)
 
 
-def exploring(actor: Actor) -> Chooser:
-    """The actor's policy with exploration."""
-    return actor.act
-
-
 def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
     """Split episodes into parts of at most `size`, as views without copies."""
     for first in range(0, episodes.count, size):

@@ -14,7 +14,7 @@ from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.base.ddpg import Ddpg
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
-from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates, single
+from tangram_lab.benchmarks.measure import Row, Work, rates, row_of
 from tangram_lab.benchmarks.setups import (
     goal_config,
     played,
@@ -41,8 +41,9 @@ def measure_learner(runs: int) -> list[Row]:
     for one, setup, size, least in cases:
         made = with_agent(setup, batch_size=size)
         whole = updates(made, learner(made, compiled=True))
-        given = ("learner", f"{one}, batch {size}, compiled", "updates/s"), whole
-        rows.append(compare(*given, ("single operations", updates(made)), runs, Bound(least)))
+        labels, rival = ("learner", f"{one}, batch {size}, compiled", "updates/s"), updates(made)
+        found = rates({"ours": whole, "theirs": rival}, runs)
+        rows.append(row_of(labels, found["ours"], "single operations", found["theirs"], least))
     return [*rows, *_goal_rows(runs, name)]
 
 
@@ -66,9 +67,9 @@ def _goal_rows(runs: int, name: str) -> list[Row]:
     shares = [work * ours / core for ours, core in pairs]
     whole = ("learner", f"{case}, compiled", "updates/s")
     return [
-        compared(labels, found["ours"], name, found[name]),
-        compared(whole, found["compiled"], name, found[name], Bound(1.5)),
-        single(("learner", case, "of the core's matrix rate"), shares, Bound(0.7)),
+        row_of(labels, found["ours"], name, found[name]),
+        row_of(whole, found["compiled"], name, found[name], 1.5),
+        row_of(("learner", case, "of the core's matrix rate"), shares, least=0.7),
     ]
 
 
@@ -145,8 +146,8 @@ def measure_gpu(runs: int) -> list[Row]:
             "one core, compiled": updates(made, learner(made, compiled=True)),
         }
         found, labels = rates(ways, runs), ("gpu", f"{name}, recorded", "updates/s")
-        for against, bound in zip([*ways][1:], (Bound(5.0), None, None), strict=True):
-            rows.append(compared(labels, found["ours"], against, found[against], bound))
+        for against, least in zip([*ways][1:], (5.0, None, None), strict=True):
+            rows.append(row_of(labels, found["ours"], against, found[against], least))
     return rows
 
 

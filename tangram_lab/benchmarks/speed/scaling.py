@@ -14,15 +14,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tangram_core.errors import TangramError
-from tangram_lab.benchmarks.measure import Bound, Row, compared, single
+from tangram_lab.benchmarks.measure import Row, row_of
 from tangram_lab.benchmarks.setups import played, preset
 from tangram_lab.benchmarks.speed.players import players
 from tangram_lab.benchmarks.trainings import numbers_of, processes_of, start_training, wait_for
 
 STAGE = "scaling"
 CORES = 8  # with fewer, two workers share cores with other processes
-LINEAR = Bound(least=0.9)
-SAME = Bound(least=0.9)
+LEAST = 0.9  # of linear scaling, and of the rates with one synthetic worker
 SYNTHETIC = 64, 1000
 BATCH = 32
 PUBLISH_S = 0.5
@@ -127,10 +126,10 @@ def _real(runs: int, folder: Path) -> Iterator[Row]:
         )
         found = [[run.rates("episodes")["episodes"] for run in (both, alone)] for _ in range(runs)]
     two, one = zip(*found, strict=True)
-    yield compared((STAGE, "2 workers, a finger", "episodes/s"), two, "1 worker", one)
+    yield row_of((STAGE, "2 workers, a finger", "episodes/s"), two, "1 worker", one)
     shares = [ours / theirs / 2.0 for ours, theirs in found]
-    bound = LINEAR if len(os.sched_getaffinity(0)) >= CORES else None
-    yield single((STAGE, "2 workers, efficiency", "of twice 1 worker"), shares, bound)
+    least = LEAST if len(os.sched_getaffinity(0)) >= CORES else None
+    yield row_of((STAGE, "2 workers, efficiency", "of twice 1 worker"), shares, least=least)
 
 
 def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
@@ -143,20 +142,20 @@ def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
         found = [(many.rates(*names), one.rates(*names)) for _ in range(runs)]
         sizes = [run.master_size() for run in (many, one)]
     case, against = f"{count:,} synthetic workers", "1 synthetic worker"
-    for name, unit, bound in (
-        ("updates", "updates/s", SAME),
+    for name, unit, least in (
+        ("updates", "updates/s", LEAST),
         ("hub/batches", "messages/s", None),
         ("hub/published", "broadcasts/s", None),
     ):
         ours, theirs = [m[name] for m, _ in found], [o[name] for _, o in found]
-        yield compared((STAGE, case, unit), ours, against, theirs, bound)
+        yield row_of((STAGE, case, unit), ours, against, theirs, least)
     # Per CPU second, so that load of other programs during one of the runs does not count.
     ours, theirs = (
         [run["updates"] / run["cpu"] for run in both] for both in zip(*found, strict=True)
     )
-    yield compared((STAGE, case, "updates per CPU second"), ours, against, theirs)
+    yield row_of((STAGE, case, "updates per CPU second"), ours, against, theirs)
     for unit, ours, theirs in zip(("MiB", "descriptors"), *sizes, strict=True):
-        yield compared((STAGE, f"{case}, the master's", unit), [ours], against, [theirs])
+        yield row_of((STAGE, f"{case}, the master's", unit), [ours], against, [theirs])
 
 
 @contextmanager

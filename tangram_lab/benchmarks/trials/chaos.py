@@ -33,7 +33,7 @@ from tangram_lab.benchmarks.trainings import (
     wait_for,
 )
 from tangram_lab.benchmarks.trials.proxy import DOWN, UP, Proxy
-from worker.play.rollout import Rollout, exploring
+from worker.play.rollout import Rollout
 from worker.play.session import Acting
 from worker.status import ask_status
 from worker.talk.client import Client
@@ -99,7 +99,7 @@ class Witness(Thread):
                 newest = client.newest_weights()
                 if newest is not None:
                     acting.follow(newest)
-                episodes = rollout.play(exploring(acting.actor))
+                episodes = rollout.play(acting.actor.act)
                 self.sent.append(keys(episodes["corners"][:, 0], episodes.actions[:, 0]))
                 if not client.send(episodes, acting.version):
                     self.sent.pop()

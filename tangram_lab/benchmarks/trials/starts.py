@@ -101,49 +101,23 @@ def strange_master(folder: Path, name: str) -> Seen:
     return not raw and b"owned" in said, f"raw: {raw}, {said[-60:]!r}"
 
 
+# What -> row, amount, name of a file in the run folder and its content.
+FILES = {
+    "a training that is to be extended": ("17", "20 updates", "", b""),
+    "a curve of 12 days": ("17", "100,000 lines", "curve.jsonl", LINE * 100_000),
+    "a curve with a broken line": ("17", "1 byte", "curve.jsonl", LINE + b"\xff\n"),
+    "a file in the place of TensorBoard's folder": ("17", "1", "tensorboard", b"x"),
+    "a lease left by a machine that died": ("21", "1", LEASE, b'{"host": "x", "id": "y"}'),
+}
 STARTS: list[Attack] = [
     ("16", "two trainings begun on one new folder", ".7 s apart", two_at_once),
-    (
-        "17",
-        "a training that is to be extended",
-        "20 updates",
-        partial(goes_on, name="", content=b""),
-    ),
-    (
-        "17",
-        "a curve of 12 days",
-        "100,000 lines",
-        partial(goes_on, name="curve.jsonl", content=LINE * 100_000),
-    ),
-    (
-        "17",
-        "a curve with a broken line",
-        "1 byte",
-        partial(goes_on, name="curve.jsonl", content=LINE + b"\xff\n"),
-    ),
-    (
-        "17",
-        "a file in the place of TensorBoard's folder",
-        "1",
-        partial(goes_on, name="tensorboard", content=b"x"),
-    ),
-    (
-        "21",
-        "a lease left by a machine that died",
-        "1",
-        partial(goes_on, name=LEASE, content=b'{"host": "x", "id": "y"}'),
+    *(
+        (row, what, amount, partial(goes_on, name=name, content=content))
+        for what, (row, amount, name, content) in FILES.items()
     ),
     ("18", "a port that a neighbour has", "1", port_taken),
-    (
-        "20",
-        "escapes from a strange master to a worker",
-        "1",
-        partial(strange_master, name="worker"),
-    ),
-    (
-        "20",
-        "escapes from a strange master to tangram-status",
-        "1",
-        partial(strange_master, name="status"),
+    *(
+        ("20", f"escapes from a strange master to {who}", "1", partial(strange_master, name=name))
+        for who, name in (("a worker", "worker"), ("tangram-status", "status"))
     ),
 ]

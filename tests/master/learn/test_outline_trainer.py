@@ -13,7 +13,7 @@ from tangram_sim.motion.actions import corner_bound
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.builders import Policy
 from tests.master.builders import trainer
-from worker.play.rollout import Rollout, exploring
+from worker.play.rollout import Rollout
 
 pytestmark = pytest.mark.fast
 
@@ -25,9 +25,7 @@ MADE = outline_setup(
 def rolled_out(made: Setup, count: int = 2, seed: int = 0) -> Episodes:
     """What a worker of four environments plays."""
     with closing(made.task.make(4)) as env:
-        return Rollout(env, made.spec, seed, "player", 0, 1).play(
-            exploring(Policy(made).actor), count
-        )
+        return Rollout(env, made.spec, seed, "player", 0, 1).play(Policy(made).actor.act, count)
 
 
 def test_what_workers_play_is_learned_from() -> None:

@@ -103,7 +103,7 @@ def test_what_is_waited_for(
 def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"]))
     episodes = arrival(MADE, 1).episodes
-    gone = np.zeros((4, MADE.task.horizon + 1, 1), np.uint8)
+    gone = np.zeros((4, MADE.task.spec.horizon + 1, 1), np.uint8)
     made.guard.trainer.insert(Episodes({**episodes.arrays, "seen": gone, "goals_seen": gone[:, 0]}))
     said = f"waiting for an episode to learn from: {MADE.task.waits}"
     assert made.reporter.flush(0).texts["activity"] == said

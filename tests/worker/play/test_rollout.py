@@ -17,7 +17,7 @@ from tangram_tasks.played import Played
 from tests.agent.builders import PAIR, SQUARE, Policy, setup
 from tests.sim.builders import sample_poses
 from tests.worker.builders import policy
-from worker.play.rollout import Rollout, exploring, parts, play
+from worker.play.rollout import Rollout, parts, play
 
 pytestmark = pytest.mark.fast
 
@@ -38,7 +38,7 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
         limited = layout.tokens == 1 and sim.actions_per_token > 1
         return (moves >= sim.actions_per_token) & (not limited)
 
-    for _ in range(made.task.horizon):
+    for _ in range(made.task.spec.horizon):
         flags = is_placed(moves)
         action = acting.explore(corners[-1][None], flags[None], goal[None], [rng])[0]
         token = 0
@@ -70,9 +70,7 @@ def environment(made: Setup, count: int = 4) -> Iterator[PlaceEnv]:
 def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
     with environment(made, envs) as env:
         rollout, acting = Rollout(env, made.spec, *IDENTITY), policy(made)
-        played = [
-            rollout.play(exploring(acting.actor), groups) for groups in (1, count // envs - 1)
-        ]
+        played = [rollout.play(acting.actor.act, groups) for groups in (1, count // envs - 1)]
         assert rollout.episode == count
     names = played[0].arrays
     return Episodes({n: np.concatenate([one[n] for one in played]) for n in names})
@@ -109,8 +107,7 @@ def test_each_part_of_the_identity_gives_other_episodes(position: int) -> None:
     other[position] = "evaluator" if position == 1 else IDENTITY[position] + 1
     with environment(made) as env:
         one, two = (
-            Rollout(env, made.spec, *who).play(exploring(policy(made).actor))
-            for who in (IDENTITY, other)
+            Rollout(env, made.spec, *who).play(policy(made).actor.act) for who in (IDENTITY, other)
         )
     assert not np.isclose(one["goals"], two["goals"]).any(axis=(1, 2)).all()
     assert not np.isclose(one["corners"][:, 0], two["corners"][:, 0]).any(axis=(1, 2)).all()
@@ -132,7 +129,7 @@ def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: boo
     made = setup(pixels=32 * camera)
     acting = policy(made)
     with environment(made, 3) as env:
-        given = env, made.spec, exploring(acting.actor), np.random.default_rng
+        given = env, made.spec, acting.actor.act, np.random.default_rng
         four, six = (Played.of(play(*given, count, facts=True)) for count in (4, 6))
     assert len(four.overlap) == len(four.starts) == four.episodes.count == 4
     np.testing.assert_array_equal(four.corners, six.corners[:4])
@@ -147,7 +144,7 @@ def test_play_ends_before_an_action_when_it_is_told_to(asked: int, groups: int) 
     answers = iter([True] * asked + [False])
     with environment(made, 3) as env:
         rollout = Rollout(env, made.spec, *IDENTITY)
-        episodes = rollout.play(exploring(policy(made).actor), 5, lambda: next(answers))
+        episodes = rollout.play(policy(made).actor.act, 5, lambda: next(answers))
     assert episodes.count == rollout.episode == 3 * groups
 
 
@@ -158,7 +155,7 @@ def test_the_time_of_choices_is_that_of_those_who_go_on(monkeypatch: pytest.Monk
         step = env.step
         ended = np.array([True, False])
         monkeypatch.setattr(env, "step", lambda one: replace(step(one), terminated=ended))
-        acting = exploring(policy(made).actor)
+        acting = policy(made).actor.act
         played = play(env, made.spec, acting, lambda i: episode_generator(*IDENTITY, i), 2)
     assert played.chose.tolist() == [0.5, 1.5]
 

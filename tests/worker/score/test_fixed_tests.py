@@ -119,7 +119,7 @@ def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(f
     none = History({}, np.zeros((500, 0, 3), np.float32))
     one, two = (choose(seen, none, evaluation_generators(500)) for _ in range(2))
     np.testing.assert_array_equal(one, two)
-    assert one.shape == (500, made.task.action_size)
+    assert one.shape == (500, made.task.spec.action_size)
     np.testing.assert_allclose(one.min(axis=0), -1.0, atol=0.05)
     np.testing.assert_allclose(one.max(axis=0), 1.0, atol=0.05)
 

@@ -46,7 +46,7 @@ def played_in(made: Setup, ways: list[Floats], goal: Floats) -> Episodes:
             "corners": corners,
             "placed": placed,
             "goals": as_rows(outline, layout, made.task.goal_rows)[None].astype(np.float32),
-            "actions": np.zeros((1, len(ways) - 1, made.task.action_size), np.float32),
+            "actions": np.zeros((1, len(ways) - 1, made.task.spec.action_size), np.float32),
             "rewards": np.zeros((1, len(ways) - 1), np.float32),
             "terminated": placed[:, 1:].all(axis=2).astype(np.uint8),
         }

@@ -72,7 +72,7 @@ def transitions(made: Setup, count: int, seed: int = 0, placed: float = 0.4) -> 
     return Transitions(
         state=corners[:, 0],
         placed=flags,
-        action=rng.uniform(-1.0, 1.0, (count, made.task.action_size)).astype(np.float32),
+        action=rng.uniform(-1.0, 1.0, (count, made.task.spec.action_size)).astype(np.float32),
         reward=np.zeros(count, np.float32),
         next_state=corners[:, 1],
         next_placed=flags,
