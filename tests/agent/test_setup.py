@@ -75,6 +75,7 @@ def with_sections(config: dict[str, Any], more: dict[str, Any]) -> dict[str, dic
         (changed("net", hidden=[]), "net.hidden must name at least one layer"),
         (changed("net", hidden=[0]), "net.hidden must be between 1 and 65536, got 0"),
         (changed("net", init="none"), "net.init must be one of fan_in, authors"),
+        (BASE | {"sim": 3}, "the section sim must be a mapping, got 3"),
         ({n: BASE[n] for n in ("task", "tokens", "agent")}, "no section sim, reward, net"),
         (
             {"tokens": {}, "agent": {"kind": "pair"}},
@@ -214,6 +215,11 @@ FUTURE = [{"strategy": "future"}]
             ONE,
             {"agent": {"hindsight": [{"strategy": "final", "angle": 0.1}]}},
             "agent.hindsight.angle=0.1 changes nothing with agent.hindsight.strategy=final",
+        ),
+        (
+            ONE,
+            {"agent": {"replay_capacity": 64}, "sim": {"actions_per_token": 65}},
+            "agent.replay_capacity must hold one episode, at least 65, got 64",
         ),
         (ONE, {"sim": {"mirrored": 0.5}}, "sim.mirrored=0.5 .* take a set with a parallelogram"),
     ],

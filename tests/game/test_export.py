@@ -135,6 +135,11 @@ def test_what_onnx_does_not_know_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
         export.exported(own)
 
 
+def test_only_an_onnx_file_is_written() -> None:
+    with pytest.raises(ConfigError, match=r"out must end with .onnx, got 'a.pt': set out=agent"):
+        ExportConfig("pretrained/square", "a.pt")
+
+
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tangram_game.config.find_spec", lambda name: name == "onnx" or None)
     with pytest.raises(ConfigError, match="pip install onnxscript onnxruntime$"):

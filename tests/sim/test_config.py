@@ -67,6 +67,11 @@ REFUSED = [
     (SimConfig, {"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
     (SimConfig, {"pixels": 15}, "sim.pixels must be 0 or at least 16, got 15"),
     (SimConfig, {"observe": "pictures"}, "^sim.observe=pictures needs .*: set sim.pixels=128$"),
+    (
+        SimConfig,
+        {"observe": "pictures", "pixels": 64, "view": 2.0},
+        "needs pictures of the arena, got sim.view=2: set sim.view=1",
+    ),
     (SimConfig, {"targets": "x"}, "sim.targets must be one of uniform, .* touching, got 'x'"),
     (SimConfig, {"starts": "x"}, "sim.starts must be one of anywhere, outside, got 'x'"),
     (SimConfig, {"mirrored": 2.0}, "sim.mirrored must be between 0 and 1, got 2"),
@@ -77,6 +82,7 @@ REFUSED = [
     (RewardConfig, {"name": "module:function"}, "got 'module:function'"),
     (RewardConfig, {"source": "eyes"}, "reward.source must be one of polygon, camera"),
     (RewardConfig, {"name": "dense", "source": "camera"}, "set reward.source=polygon"),
+    (RewardConfig, {"sha256": "ab"}, "^reward.sha256 changes nothing with reward.name=overlap"),
 ]
 
 

@@ -60,20 +60,31 @@ def test_who_waits_is_told_and_who_leaves_takes_no_turn_along_and_leaves_none_be
         return wait
 
     async def work(jobs: Jobs) -> None:
-        asked = list[asyncio.Task[Any]]()
-        for number in range(4):
-            asked.append(asyncio.create_task(jobs.do(time.sleep, 0.5, waits=waits(number))))
-            await asyncio.sleep(0.01)
-        await asyncio.gather(*asked)
-        # Those who come earlier and what is being done, and again when it is less.
-        assert heard == {1: [1], 2: [2, 1], 3: [3, 2, 1]}
         ends = [tmp_path / str(number) for number in range(4)]
-        tasks = [("sh", "-c", f"sleep 0.6; touch {end}") for end in ends]
-        asked = [asyncio.create_task(jobs.do(subprocess.call, task)) for task in tasks]
-        await asyncio.sleep(0.3)  # longer than the wait that is not worth a word
+        asked = list[asyncio.Task[Any]]()
+        for number, end in enumerate(ends):
+            task = subprocess.call, ("sh", "-c", f"until [ -e {end} ]; do sleep 0.02; done")
+            asked.append(asyncio.create_task(jobs.do(*task, waits=waits(number))))
+            await asyncio.sleep(0.01)
+        # Those who come earlier and what is being done, and again when it is less.
+        whole = {1: [1], 2: [2, 1], 3: [3, 2, 1]}
+        for done, end in enumerate(ends):
+            while heard != {number: told[: done + 1] for number, told in whole.items()}:
+                await asyncio.sleep(0.01)
+            end.touch()
+        await asyncio.gather(*asked)
+        assert heard == whole
+        begun, go = tmp_path / "begun", tmp_path / "go"
+        ends = [tmp_path / f"end {number}" for number in range(4)]
+        first = f"touch {begun}; until [ -e {go} ]; do sleep 0.02; done; touch '{ends[0]}'"
+        lines = [first, *(f"touch '{end}'" for end in ends[1:])]
+        asked = [asyncio.create_task(jobs.do(subprocess.call, ("sh", "-c", one))) for one in lines]
+        while not begun.exists():
+            await asyncio.sleep(0.01)
         for one in asked:  # what has begun goes on, the rest never begins
             one.cancel()
         await asyncio.gather(*asked, return_exceptions=True)
+        go.touch()
         pids = await asyncio.gather(*(jobs.do(os.getpid) for _ in range(3)))
         assert len(set(pids)) == 1
         assert [end.exists() for end in ends] == [True, False, False, False]

@@ -74,6 +74,13 @@ def test_every_address_takes_keys_unless_it_is_opened_by_name(bind: str) -> None
     assert not needs_keys(ServiceConfig())
 
 
+def test_a_network_without_encryption_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zmq.has", lambda _: False)
+    with pytest.raises(ConfigError, match="built without CURVE: .* leave service.bind at local"):
+        needs_keys(ServiceConfig(bind="0.0.0.0"))  # noqa: S104
+    assert not needs_keys(ServiceConfig(bind="0.0.0.0", auth="off"))  # noqa: S104
+
+
 @pytest.mark.parametrize(
     ("make", "reason"),
     [

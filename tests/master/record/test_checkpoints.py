@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -122,6 +123,23 @@ def test_an_old_one_that_cannot_be_deleted_is_told_and_ends_nothing(
     assert caplog.messages == [f"{tmp_path}/{told}"]
     save(tmp_path, updates=7, keep=1)
     assert names(tmp_path) == ["00000007"]
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "weights.safetensors"])
+def test_a_disk_that_fails_is_no_reason_to_take_an_older_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    real, path = Path.open, save(tmp_path)
+
+    def fail(self: Path, *given: Any, **named: Any) -> Any:
+        if self.name == name:
+            raise OSError(errno.EIO, "Input/output error")
+        return real(self, *given, **named)
+
+    monkeypatch.setattr(Path, "open", fail)
+    with pytest.raises(RunError, match="cannot read checkpoint .*Input/output") as caught:
+        load_checkpoint(path)
+    assert not isinstance(caught.value, CorruptError)
 
 
 def test_a_slow_disk_is_no_reason_to_end_the_process(

@@ -42,7 +42,7 @@ def full(*_: object) -> int:
 
 
 @contextmanager
-def living(path: Path) -> Iterator[None]:
+def living(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     over = threading.Event()
 
     def live() -> None:
@@ -52,7 +52,9 @@ def living(path: Path) -> Iterator[None]:
     thread = threading.Thread(target=live)
     thread.start()
     try:
-        yield
+        with monkeypatch.context() as patient:  # the thread may have to wait for a processor
+            patient.setattr(lease_module, "STALE_S", 60.0)
+            yield
     finally:
         over.set()
         thread.join()
@@ -60,17 +62,20 @@ def living(path: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize("age_s", [0.0, 1000.0, -1000.0], ids=["now", "clock set on", "set back"])
 def test_a_process_of_another_machine_that_lives_keeps_its_folder(
-    age_s: float, tmp_path: Path
+    age_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Perhaps for no more than the moment in which its job ends, after it was queued again."""
     path, host = of_another(tmp_path, age_s, socket.gethostname()), socket.gethostname()
-    with living(path), pytest.raises(UnavailableError, match=f"by a process on {host}: choose"):
+    with (
+        living(path, monkeypatch),
+        pytest.raises(UnavailableError, match=f"by a process on {host}: choose"),
+    ):
         RunFolder(tmp_path).lock()
     with RunFolder(tmp_path).lock() as claim:  # which the one that was refused did not keep
         assert json.loads(path.read_text())["id"] != "theirs"
         claim.run.path.joinpath(".lock").unlink()
         of_another(tmp_path)
-        with living(path), pytest.raises(FailedError, match="lost: a process on far"):
+        with living(path, monkeypatch), pytest.raises(FailedError, match="lost: a process on far"):
             claim.check()
 
 

@@ -16,7 +16,7 @@ from tangram_agent.agents.goal.learner import GoalLearner
 from tangram_agent.base.compiling import Whole
 from tangram_agent.flat.actor_critic import ActorCritic, Batch, Loss
 from tangram_core.agent import NotFiniteError
-from tangram_core.errors import ConfigError
+from tangram_core.errors import ConfigError, RunError
 from tests.agent.agents.goal.worlds import Line
 
 pytestmark = pytest.mark.fast
@@ -180,6 +180,21 @@ def test_a_run_begins_with_anothers_networks_and_new_optimisers() -> None:
 def test_settings_that_cannot_work_are_refused(changes: dict[str, Any], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         replace(SMALL, **changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("mean", np.nan, "damaged weights: the statistics must be finite, with positive scales"),
+        ("scale", 0.0, "damaged weights: the statistics must be finite, with positive scales"),
+        ("policy.layers.0.weight", np.nan, r"damaged weights: 'layers.0.weight' must hold finite"),
+        ("policy.layers.0.weight", 2e6, r"finite numbers up to 1e\+06: take them from another"),
+    ],
+)
+def test_damaged_weights_are_not_played(name: str, value: float, told: str) -> None:
+    weights = Goal(SMALL).learner(TASK, 0, "cpu").broadcast()
+    with pytest.raises(RunError, match=told):
+        Goal(SMALL).actor(TASK).load(weights | {name: np.full_like(weights[name], value)})
 
 
 def test_other_settings_are_other_agents() -> None:

@@ -17,6 +17,7 @@ from tangram_agent.agents.outline.values import Corners
 from tangram_agent.base.config import NetConfig
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
+from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.dissections import Place
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.targets import placement
@@ -178,6 +179,8 @@ def test_a_lone_token_a_perceptron_and_one_side_are_refused() -> None:
     made = outline_setup(ALL)
     with pytest.raises(ConfigError, match="sim.allow_flip=true"):
         made.task.with_sim(allow_flip=False)
+    with pytest.raises(ConfigError, match="reward.name=dense changes nothing .* set task=place"):
+        replace(made.task, reward=RewardConfig(name="dense")).check(plays=False)
     with pytest.raises(ConfigError, match="net.kind=mlp"):
         replace(made, agent=replace(made.agent, net=NetConfig(kind="mlp")))
 
