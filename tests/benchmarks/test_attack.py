@@ -148,11 +148,12 @@ def test_strangers_take_little_memory_few_files_and_nobodys_turn(
 def test_a_witness_must_be_acknowledged_again(
     standing: Standing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(harms, "ENDS_S", 0.5)
+    monkeypatch.setattr(harms, "ENDS_S", 0.1)
     witness = Witness("nobody", standing.setup)
     monkeypatch.setattr(witness, "is_alive", lambda: True)
     witness.acknowledged = 5
     assert not acknowledged_again(witness)
+    monkeypatch.setattr(harms, "ENDS_S", 60.0)
     more = Timer(0.1, setattr, [witness, "acknowledged", 6])
     more.start()
     assert acknowledged_again(witness)
