@@ -64,7 +64,9 @@ def write_line(path: Path, event: str, **fields: Any) -> None:
         if path.exists() and path.stat().st_size > MAX_BYTES:
             path.replace(path.with_name(f"{path.name}.old"))
         # Private, because another user could misuse the process ids in the file.
-        with open(path, "a", encoding="utf-8", opener=private) as file:
-            file.write(line + "\n")
+        with open(path, "ab+", opener=private) as file:
+            file.seek(max(0, file.tell() - 1))
+            half = file.read() not in (b"", b"\n")  # of a line before, as by a full disk
+            file.write(b"\n" * half + line.encode() + b"\n")
     except OSError as error:
         raise TangramError(f"{path} cannot be written ({error.strerror})") from None

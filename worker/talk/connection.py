@@ -119,6 +119,7 @@ class Sockets:
                 frames = self._dealer.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
+            self._doubts = 0  # the keys are right
             yield frames
 
     def weights(self) -> bytes | None:

@@ -238,3 +238,13 @@ def test_the_audit_is_bounded_and_counts_what_it_leaves_out(
         lost.note("joined")
     assert len(caplog.messages) == 1
     assert "a line of the audit is missing" in caplog.text
+
+
+def test_a_line_of_which_half_was_written_harms_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    path.write_text('{"time": "20')  # the disk was full
+    for event in ("joined", "left"):
+        Audit(path).note(event)
+    half, *lines = path.read_text().splitlines()
+    assert half == '{"time": "20'
+    assert [json.loads(line)["event"] for line in lines] == ["joined", "left"]

@@ -12,7 +12,7 @@ import zmq
 
 from tangram_core.errors import TangramError, UnavailableError
 from tangram_core.wire.addresses import KEEPALIVE
-from tangram_core.wire.messages import Alive, Greet, Hello
+from tangram_core.wire.messages import Alive, Greet, Heartbeat, Hello
 from tests.agent.messages import SHAPES, episodes, weights
 from tests.master.hub.dealers import staged
 from tests.ports import free_ports
@@ -29,6 +29,8 @@ from tests.worker.talk.conversation import (
 )
 from worker.talk import client as client_module
 from worker.talk.client import Client
+from worker.talk.connection import SURE, Sockets
+from worker.talk.discovery import MasterAddress
 
 pytestmark = pytest.mark.cluster
 
@@ -195,6 +197,37 @@ def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFix
         ):
             assert time.monotonic() < deadline
         stage.until(lambda: told(f"the master at {endpoint} answers again"))
+
+
+def test_an_answer_ends_doubts_about_the_keys(
+    master: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over weeks a few handshakes fail under load."""
+    events = list[dict[str, int]]()
+    monkeypatch.setattr("worker.talk.connection.recv_monitor_message", lambda _: events.pop())
+    monitor = SimpleNamespace(poll=lambda _: events)
+
+    def fails(sockets: Sockets, count: int) -> bool:
+        events.extend([{"event": zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL}] * count)
+        with monkeypatch.context() as seen:
+            seen.setattr(sockets, "_monitor", monitor)
+            seen.setattr(sockets, "_ready", [monitor])
+            return sockets.handshake_failed()
+
+    with zmq.Context() as context:
+        sockets = Sockets(context, MasterAddress(master.endpoint))
+        try:
+            assert not fails(sockets, SURE - 1)
+            sockets.send(Heartbeat({}).encode())
+            while master.listen() is None:
+                pass
+            master.say(Greet())
+            while not list(sockets.messages()):
+                sockets.wait(0.1)
+            assert not fails(sockets, SURE - 1)
+            assert fails(sockets, 1)
+        finally:
+            sockets.close()
 
 
 def test_a_master_that_moved_is_followed_at_once(tmp_path: Path) -> None:
