@@ -115,6 +115,13 @@ def tell(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
+def with_absolute(settings: Plain, *names: str) -> Plain:
+    """Make folders absolute, from the current folder; leave values that are not texts alone."""
+    texts = {name: settings.get(name) for name in names}
+    found = {n: text for n, text in texts.items() if isinstance(text, str) and text.strip()}
+    return settings | {n: str(Path(text).expanduser().absolute()) for n, text in found.items()}
+
+
 def _check_presets(folder: str | None) -> None:
     """Raise ConfigError for a broken or empty preset in the user's folder."""
     if folder is None:

@@ -5,10 +5,9 @@ Slow imports come after the config is composed, so --help and error messages app
 
 import os
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conf.cli import entry, tell
+from conf.cli import entry, tell, with_absolute
 from conf.commands import Plain
 from tangram_core.errors import OwnCodeError, TangramError
 from tangram_core.registry import AGENT, SHA256, TASK
@@ -48,7 +47,7 @@ def _keys(settings: Plain) -> int:
 
 
 def _train(settings: Plain) -> int:
-    _make_absolute(settings)
+    settings = with_absolute(settings, "run_dir", "warm_start")
     # The children check the config again; here a wrong task is refused before any of them starts.
     config, _ = _checked(settings, plays=True)
     tell(f"starts in {config.run_dir}")
@@ -61,7 +60,7 @@ def _train(settings: Plain) -> int:
 def _master(settings: Plain) -> int:
     from tangram_core.settings import refuse_ignored
 
-    _make_absolute(settings)
+    settings = with_absolute(settings, "run_dir", "warm_start")
     config, setup = _checked(settings, plays=False)
     if config.workers > 1 and config.service.mode == "async":
         given, alone = f"workers={config.workers}", "service.mode=async in tangram-master"
@@ -131,11 +130,3 @@ def _hold_own_code(setup: "Setup") -> None:
         check_task(setup.task)
     if AGENT in own:
         check_agent(setup.agent, setup.task)
-
-
-def _make_absolute(settings: Plain) -> None:
-    """Make the paths of folders absolute; values that are not strings stay as they are."""
-    for name in ("run_dir", "warm_start"):
-        value = settings.get(name)
-        if isinstance(value, str) and value.strip():
-            settings[name] = str(Path(value).expanduser().absolute())

@@ -85,7 +85,7 @@ class EvalConfig(Settings):
         0, "seed of the test episodes, or of the starts of puzzles", low=0, high=MAX_SEED
     )
     rivals: tuple[str, ...] = setting(
-        ALL, "baselines that play the same episodes: all of the task, some by name, or [] for none"
+        ALL, "rivals that play the same episodes: all of the task, some by name, or [] for none"
     )
     out: str | None = setting(None, "JSON file for the scores, which are also printed")
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)

@@ -177,37 +177,32 @@ def _beside(task: Place) -> Place:
     return replace(task, sim=replace(task.sim, starts="outside"))
 
 
-def end_picture(show: Show) -> Image.Image:
-    """A picture of the ends of all episodes."""
-    layout, arena, played = show.task.layout, show.task.sim.arena, show.played
-    return figure_sheet(layout, arena, played.ends, played.goals, show.titles)
-
-
 def _frames(show: Show, out: str) -> list[Image.Image]:
     """Frames of the film, or one picture of the ends."""
     task, played = show.task, show.played
-    still, game = _is_still(out), task.layout.tokens > 1 or show.seen is not None
-    count = len(show.titles)
+    game, count = task.layout.tokens > 1 or show.seen is not None, len(show.titles)
     columns, size = tiles(count, WIDTH) if game else _tiles(count, SHEET)
     sheets = camera_sheets(task, played, columns, size)
-    if still:
-        end = end_picture(show) if game else draw_sheet(task, played, played.ends)
-        return [side_by_side([*_before(show), end, *sheets[-1:]])]
+    before = [] if show.seen is None else [show.seen]  # from which the target comes
+    if _is_still(out):
+        ends = (played.ends, played.goals, show.titles)
+        end = (
+            figure_sheet(task.layout, task.sim.arena, *ends)
+            if game
+            else draw_sheet(task, played, played.ends)
+        )
+        return [side_by_side([*before, end, *sheets[-1:]])]
     frames = film_pictures(show) if game else draw_motion(task, played)
     if sheets:
         pairs = zip(frames, beside(frames, sheets), strict=True)
         frames = [side_by_side(pair) for pair in pairs]
-    before = [ImageOps.pad(one, frames[0].size, color=PAPER) for one in _before(show)]
-    return [one for one in before for _ in range(SEEN)] + with_stills(frames)
+    first = [ImageOps.pad(one, frames[0].size, color=PAPER) for one in before]
+    stills = [frames[0]] * STILL_START, [frames[-1]] * STILL_END
+    return [*(one for one in first for _ in range(SEEN)), *stills[0], *frames, *stills[1]]
 
 
 def _is_still(out: str) -> bool:
     return Path(out).suffix == ".png"
-
-
-def _before(show: Show) -> list[Image.Image]:
-    """Pictures before the film: the one from which the target comes, if any."""
-    return [] if show.seen is None else [show.seen]
 
 
 def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
@@ -244,11 +239,6 @@ def draw_motion(task: Place, played: Played) -> list[Image.Image]:
     return [
         draw_sheet(task, played, corners) for corners in motion(task.layout, played.corners, count)
     ]
-
-
-def with_stills(frames: list[Image.Image]) -> list[Image.Image]:
-    """The same film with still frames added before and after."""
-    return [frames[0]] * STILL_START + frames + [frames[-1]] * STILL_END
 
 
 def motion(layout: Layout, corners: Floats, count: int) -> list[Floats]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from conf.cli import composed, entry
+from conf.cli import composed, entry, with_absolute
 from conf.commands import Plain
 from tangram_core.errors import ConfigError
 from tangram_core.settings import Settings, setting
@@ -28,7 +28,7 @@ def _experiment(settings: Plain) -> int:
     from tangram_core.store.files import check_writable
     from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 
-    config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir", "out"))
+    config = from_mapping(StudyConfig, with_absolute(settings, "run_dir", "out"))
     rows = Path(config.out or config.run_dir) / f"{config.study}.csv"
     check_writable("out" if config.out else "run_dir", rows)
     jobs = list(jobs_of(config, read_studies()))
@@ -84,7 +84,7 @@ def report() -> int:
 def _report(settings: Plain) -> int:
     from tangram_core.setup import from_mapping
 
-    config = from_mapping(ReportConfig, _with_absolute(settings, "runs", "out"))
+    config = from_mapping(ReportConfig, with_absolute(settings, "runs", "out"))
     if config.check:
         return _check_pages()
 
@@ -105,10 +105,3 @@ def _check_pages() -> int:
     wrong = check(ROOT / RESULTS, [page for page in pages if page.name not in GENERATED])
     print("\n".join(wrong) or "every score in README and docs is in a file that its section links")
     return 1 if wrong else 0
-
-
-def _with_absolute(settings: Plain, *names: str) -> Plain:
-    """Make folders absolute, from the current folder; leave values that are not texts alone."""
-    texts = {name: settings.get(name) for name in names}
-    found = {n: text for n, text in texts.items() if isinstance(text, str) and text.strip()}
-    return settings | {n: str(Path(text).expanduser().absolute()) for n, text in found.items()}

@@ -5,14 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFilter
+from PIL import Image, ImageDraw
 
 from tangram_core.arrays import Floats
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.drawing.strokes import (
     SAMPLES,
     SILHOUETTE,
-    Point,
     colour_of,
     darker,
     draw_outline,
@@ -121,22 +120,11 @@ def _draw_held(canvas: Image.Image, arena: float, held: Held, corners: Floats) -
     nearer = middle + (corners - middle) * (1.0 + _NEARER * held.height)
     if held.height > 0.0:
         way = np.array(_SHADOW_WAY) * arena * held.height
-        _draw_shadow(canvas, to_points(arena, nearer + way, canvas.width), held.height)
+        shadow, blur = to_points(arena, nearer + way, canvas.width), _SHADOW_BLUR * held.height
+        fill(canvas, shadow, _INK, _SHADOW, blur * canvas.width)
     piece = to_points(arena, nearer, canvas.width)
     fill(canvas, piece, colour_of(held.token), 1.0)
     draw_outline(canvas, piece, _RED if held.stopped else _INK, 2.0)
     if held.finger is not None:
         ends = held.finger + np.array([[-_FINGER, _FINGER], [_FINGER, -_FINGER]])
         ImageDraw.Draw(canvas).ellipse(to_points(arena, ends, canvas.width), _INK)
-
-
-def _draw_shadow(canvas: Image.Image, outline: Sequence[Point], height: float) -> None:
-    """Draw a blurred dark polygon; the blur grows with the height of the piece."""
-    blur = _SHADOW_BLUR * canvas.width * height
-    room = 3.0 * blur
-    low = np.floor(np.min(outline, axis=0) - room).astype(int)
-    size = np.ceil(np.max(outline, axis=0) + room).astype(int) - low
-    mask = Image.new("L", (int(size[0]), int(size[1])), 0)
-    inside = [(x - float(low[0]), y - float(low[1])) for x, y in outline]
-    ImageDraw.Draw(mask).polygon(inside, round(255 * _SHADOW))
-    canvas.paste(_INK, (int(low[0]), int(low[1])), mask.filter(ImageFilter.GaussianBlur(blur)))

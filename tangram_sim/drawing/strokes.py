@@ -7,7 +7,7 @@ are smooth. Points are in pixels of the canvas, y down.
 from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFilter
 
 from tangram_core.arrays import Floats
 from tangram_sim.geometry.layout import Layout
@@ -62,13 +62,21 @@ def to_outlines(layout: Layout, arena: float, corners: Floats, side: int) -> lis
     return [points[layout.corners_of(k)] for k in range(layout.tokens)]
 
 
-def fill(canvas: Image.Image, outline: Sequence[Point], colour: Colour, opacity: float) -> None:
-    """Fill a polygon with a colour; parts outside the canvas are cut off."""
-    low = np.floor(np.min(outline, axis=0)).astype(int)
-    size = np.ceil(np.max(outline, axis=0)).astype(int) - low + 1
+def fill(
+    canvas: Image.Image,
+    outline: Sequence[Point],
+    colour: Colour,
+    opacity: float,
+    blur: float = 0.0,
+) -> None:
+    """Fill a polygon with a colour, its edge blurred by `blur` pixels; cut off at the canvas."""
+    low = np.floor(np.min(outline, axis=0) - 3.0 * blur).astype(int)
+    size = np.ceil(np.max(outline, axis=0) + 3.0 * blur).astype(int) - low + 1
     mask = Image.new("L", (int(size[0]), int(size[1])), 0)
     inside = [(x - float(low[0]), y - float(low[1])) for x, y in outline]
     ImageDraw.Draw(mask).polygon(inside, round(255 * opacity))
+    if blur:
+        mask = mask.filter(ImageFilter.GaussianBlur(blur))
     canvas.paste(colour, (int(low[0]), int(low[1])), mask)
 
 
