@@ -301,18 +301,8 @@ def test_every_setting_of_a_command_is_read() -> None:
 @pytest.mark.parametrize(
     ("base", "name", "value", "because"),
     [
-        (ONE, "net.hidden", [8], "net.kind=mha"),
         (MLP, "net.width", 32, "net.kind=mlp"),
-        (MLP, "net.layers", 2, "net.kind=mlp"),
-        (MLP, "net.feed_forward", 8, "net.kind=mlp"),
-        (MLP, "net.rectified", True, "net.kind=mlp"),
-        (MLP, "net.init", "authors", "net.kind=mlp"),
-        (ONE, "net.activation", "tanh", "net.kind=mha"),
-        (ONE, "sim.view", 2.0, "sim.pixels=0"),
-        (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
-        (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
-        (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
         (over(ONE, sim={"observe": "silhouette"}), "sim.pixels", 64, "sim.observe=silhouette"),
     ],
 )
@@ -321,21 +311,3 @@ def test_a_setting_without_effect_is_refused(
 ) -> None:
     with pytest.raises(TangramError, match=f"^{name}=.* changes nothing with {because}: leave it"):
         make_setup(changed(base, name, value))
-
-
-@pytest.mark.parametrize(
-    ("given", "name", "because"),
-    [
-        ({"http_bind": "::1", "http_port": -1}, "http_bind", "http_port=-1"),
-        ({"publish_seconds": 1.0, "mode": "lockstep"}, "publish_seconds", "mode=lockstep"),
-        ({"port": 5555}, "port", "bind=local"),
-        ({"host": "learner"}, "host", "bind=local"),
-        ({"auth": "off"}, "auth", "bind=local"),
-    ],
-)
-def test_a_setting_of_the_service_without_effect_is_refused(
-    given: dict[str, Any], name: str, because: str
-) -> None:
-    reason = f"^service.{name}=.* changes nothing with service.{because}: leave it "
-    with pytest.raises(TangramError, match=reason):
-        ServiceConfig(**given)

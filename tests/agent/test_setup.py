@@ -32,49 +32,27 @@ def with_sections(config: dict[str, Any], more: dict[str, Any]) -> dict[str, dic
 @pytest.mark.parametrize(
     ("config", "reason"),
     [
-        (changed("tokens", shapes=["pentagon"]), "unknown shape 'pentagon': choose from large_tri"),
         (changed("tokens", shapes="square"), "tokens.shapes must be a list, .* got 'square'"),
-        (changed("tokens", shapes=None), "shapes must be a list"),
         (changed("net", hidden=3), "hidden must be a list, .* got 3"),
-        (changed("agent", hindsight="final"), "hindsight must be a list"),
         (
             changed("tokens", shapes=[{"name": "x", "corners": [[0, 0], [1e200, 0], [0, 1e200]]}]),
             "corners must be finite and within",
         ),
-        (changed("sim", pixels=-1), "sim.pixels must be between 0 and 1024, got -1"),
         (changed("sim", arena="wide"), "^sim.arena must be a number, got wide$"),
         (changed("sim", pixels=1.5), "^sim.pixels must be a whole number, got 1.5$"),
         (changed("net", hidden=["a"]), "^net.hidden must be a list, each a whole number, got .a.$"),
         (changed("sim", speed=1), r"no setting sim\.speed: delete it; .* older version"),
         (changed("agent", gamma=1.5), "agent.gamma must be between 0 and 1, got 1.5"),
-        (changed("agent", batch_size=0), "agent.batch_size must be at least 1, got 0"),
         (
             changed("agent", batch_size=10, replay_capacity=5),
             r"batch_size \(10\) must not exceed agent.replay_capacity \(5\)",
         ),
-        (changed("agent", lr_final=1.5), "agent.lr_final must be between 0 and 1, got 1.5"),
         (changed("agent", kind="x"), "agent.kind=x: .* choose from scene, pair, outline"),
         (changed("task", kind="x"), "task.kind=x: there is no such task: choose from place, fill"),
         (changed("task", odd=1), "there is no setting task.odd: delete it"),
-        (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
-        (
-            changed("agent", kind="outline", copies=0),
-            "agent.copies must be between 1 and 64, got 0",
-        ),
-        (
-            changed("agent", copies=2),
-            "there is no setting agent.copies: delete it; .* older version",
-        ),
-        (changed("agent", hindsight=[{"strategy": "x"}]), "must be one of final, future, near"),
-        (
-            changed("agent", hindsight=[{"strategy": "near", "copies": 0}]),
-            "hindsight.copies must be between 1 and 64, got 0",
-        ),
         (changed("net", kind="cnn"), "net.kind must be one of mha, mlp, got 'cnn'"),
         (changed("net", width=65), "net.width must be a multiple of 4, got 65"),
         (changed("net", hidden=[]), "net.hidden must name at least one layer"),
-        (changed("net", hidden=[0]), "net.hidden must be between 1 and 65536, got 0"),
-        (changed("net", init="none"), "net.init must be one of fan_in, authors"),
         (BASE | {"sim": 3}, "the section sim must be a mapping, got 3"),
         ({n: BASE[n] for n in ("task", "tokens", "agent")}, "no section sim, reward, net"),
         (
@@ -166,16 +144,9 @@ def test_a_worker_plays_fewer_environments_the_longer_episodes_are(
     ("name", "value", "reason"),
     [
         ("port", 65535, "service.port must be between 0 and 65534, got 65535"),
-        ("envs", -1, "service.envs must be between 0 and 512, got -1"),
-        ("publish_seconds", -1.0, "service.publish_seconds must be at least 0, got -1"),
-        ("eval_seconds", -1.0, "service.eval_seconds must be at least 0, got -1"),
-        ("eval_episodes", 0, "service.eval_episodes must be between 1"),
-        ("checkpoint_minutes", 0.0, "service.checkpoint_minutes must be at least 0.001"),
         ("bind", "h:1", "service.bind must be an address or a name of a machine, .* got 'h:1'"),
         ("http_bind", "", "service.http_bind must be an address or a name of a machine"),
         ("host", "tcp://h", "service.host must be an address or a name of a machine"),
-        ("device", "tpu", "service.device must be one of auto, cpu, cuda, got 'tpu'"),
-        ("threads", 0, "service.threads must be between 1"),
     ],
 )
 def test_wrong_service_settings_are_refused(name: str, value: object, reason: str) -> None:
@@ -191,13 +162,12 @@ FUTURE = [{"strategy": "future"}]
 @pytest.mark.parametrize(
     ("tokens", "sections", "reason"),
     [
-        (SEVERAL, {"reward": {"name": "dense"}}, "reward.name=dense changes nothing with 2 tokens"),
-        (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
         (
             SEVERAL,
             {"reward": {"name": "dense"}},
-            "set agent=paper agent.flags=true, which values the",
+            "reward.name=dense changes nothing with 2 tokens.*set agent=paper agent.flags=true",
         ),
+        (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
         (
             SEVERAL,
             {"agent": {"gamma": 0.9}},
@@ -208,13 +178,6 @@ FUTURE = [{"strategy": "future"}]
             SEVERAL,
             {"agent": {"kind": "scene", "flags": False}},
             "flags=false with 2 tokens",
-        ),
-        (ONE, {"agent": {"kind": "scene", "reapply": 0}}, "no setting agent.reapply: "),
-        (ONE, {"agent": {"polyak": 0.9}}, "agent.polyak=0.9 changes nothing with agent.gamma=0"),
-        (
-            ONE,
-            {"agent": {"hindsight": [{"strategy": "final", "angle": 0.1}]}},
-            "agent.hindsight.angle=0.1 changes nothing with agent.hindsight.strategy=final",
         ),
         (
             ONE,
