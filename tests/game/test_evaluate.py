@@ -1,7 +1,6 @@
 """tangram-eval on run folders with random weights: what is scored, written, printed and drawn."""
 
 import json
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +10,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tangram_core.errors import ConfigError, RunError
-from tangram_game.config import EvalConfig, PlayConfig
+from tangram_core.errors import ConfigError
+from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run, score_policies, scores_table
-from tangram_game.play import play_run
 from tangram_game.scores import RUN
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_tasks.place import ONE_TOKEN, Place
@@ -122,22 +120,6 @@ def test_all_policies_of_one_token_fit_into_80_columns(capsys: pytest.CaptureFix
     printed = capsys.readouterr().out
     assert "…" not in printed
     assert printed.count("1.2345") == len(names)
-
-
-USES: dict[str, Callable[[str, str], int]] = {
-    "eval": lambda run, out: evaluate_run(EvalConfig(run, out=out)),
-    "play": lambda run, out: play_run(PlayConfig(run, out=out)),
-}
-
-
-@pytest.mark.parametrize("command", USES)
-def test_a_run_that_cannot_be_used(tmp_path: Path, command: str) -> None:
-    run = tmp_path / "run"
-    write_run(run)
-    (run / "checkpoints" / "00000007" / "weights.safetensors").write_bytes(b"")
-    with pytest.raises(RunError, match="is corrupt"):
-        USES[command](str(run), str(tmp_path / "out.gif"))
-    assert list(tmp_path.glob("out*")) == []
 
 
 # Several tokens

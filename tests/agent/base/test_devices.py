@@ -16,7 +16,6 @@ from tests.agent.base.test_ddpg import CASES
 from tests.agent.builders import learner_of, random_transitions
 
 META = "meta"
-REFUSED = (NotImplementedError, RuntimeError)
 
 
 def steps_of(learner: Ddpg, made: Setup, done: int | None) -> Steps:
@@ -61,16 +60,3 @@ def test_learning_what_can_be_filled_stays_on_its_device() -> None:
     learner.insert(episode([9.0, 9.0, 0.0]), {"hindsight": generator})
     numbers = learner.step(learner.replay.sample(8, generator), learner.rates(0.5))
     assert (numbers.device.type, len(numbers)) == (META, 3)
-
-
-@pytest.mark.fast
-def test_the_device_refuses_what_these_tests_are_for() -> None:
-    """To mix with the CPU, and to give a value to the host."""
-    made = CASES["ddpg", "paper"]()
-    away, here = learner_of(made, 0, META), learner_of(made, 0)
-    steps = steps_of(away, made, None)
-    with pytest.raises(REFUSED, match="device|meta"):
-        next(here.losses(steps))
-    loss = next(away.losses(steps))
-    with pytest.raises(REFUSED, match="meta"):
-        loss.value.item()

@@ -54,24 +54,6 @@ def test_a_worker_that_plays_nonsense_asks_for_no_update() -> None:
     made.update(0.0)
 
 
-def test_a_trainer_goes_on_from_its_state_bit_by_bit() -> None:
-    one, other = trainer(MADE), trainer(MADE, seed=5)
-    one.insert(rolled_out(MADE))
-    for _ in range(3):
-        one.update(0.1)
-    arrays, counters = one.state()
-    other.load_state(
-        {f: {n: a.copy() for n, a in own.items()} for f, own in arrays.items()}, counters
-    )
-    more = rolled_out(MADE, seed=1)
-    for made in (one, other):
-        made.insert(more)
-    assert [one.update(0.5) for _ in range(3)] == [other.update(0.5) for _ in range(3)]
-    for file, own in one.state()[0].items():
-        for name, array in own.items():
-            assert (other.state()[0][file][name] == array).all(), (file, name)
-
-
 def test_a_replay_of_another_size_keeps_the_newest() -> None:
     one = trainer(MADE)
     one.insert(rolled_out(MADE))

@@ -9,7 +9,6 @@ import pytest
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.motion.actions import full_scale
 from tangram_sim.targets.targets import check_targets
 from tests.sim.builders import TRIO, evaluation_generators, layout_of
 
@@ -23,17 +22,6 @@ def begun(layout: Layout = ONE, count: int = 3, **sim: Any) -> BatchedEnv:
     env = BatchedEnv(layout, SimConfig(**{"backend": "kinematic"} | sim), RewardConfig(), count)
     env.reset(evaluation_generators(count))
     return env
-
-
-@pytest.mark.parametrize("arena", [2.0, 5.0])
-def test_what_an_action_moves(arena: float) -> None:
-    action = np.array([[0.3, -0.4, 0.5]])
-    with closing(begun(count=1, arena=arena)) as env:
-        before = env.layout.poses(env.corners)[0, 0]
-        env.step(action)
-        way = env.layout.poses(env.corners)[0, 0] - before
-    way[2] = np.angle(np.exp(1j * (way[2] - np.pi * 0.5)))
-    np.testing.assert_allclose(way / full_scale(env.sim), [0.3, -0.4, 0.0], atol=1e-5)
 
 
 @pytest.mark.parametrize("backend", ["kinematic", "physics"])
@@ -94,12 +82,3 @@ def test_no_world_leaves_the_bound(seed: int, monkeypatch: pytest.MonkeyPatch) -
                 assert np.abs(env.seen).max() <= env.spec.field("corners").high
                 way = np.abs(env.layout.poses(env.corners) - before)[..., :2].max()
                 assert way <= sim.arena * (1.0 + slack)
-
-
-def test_a_token_alone_goes_as_far_as_the_bound_says() -> None:
-    """So the bound is not merely large."""
-    with closing(begun(actions_per_token=3)) as env:
-        for _ in range(3):
-            env.step(np.ones((3, 3)))
-        bound = env.spec.field("corners").high
-        assert 0.9 * bound < np.abs(env.corners).max() <= bound

@@ -288,17 +288,3 @@ def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path) -> None:
                 assert process.wait(LIMIT_S) == 0
             finally:
                 process.kill()
-
-
-def test_what_is_too_large_for_a_message_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = greedy_setup()
-    monkeypatch.setattr("tangram_core.wire.arrays.MAX_EPISODES", 3)
-
-    def script(hub: Hub) -> list[EpisodesArrived]:
-        hub.publish(sent(made, 1))
-        return collect(hub, lambda batches: len(batches) >= 2)
-
-    hub = open_hub(made, seed=3)
-    arrived, _ = with_master(hub, script, lambda: run_player(config(hub, index=7), made))
-    assert [batch.episodes.count for batch in arrived[:2]] == [3, 1]
-    assert_episodes(made, arrived[:2], (3, "player", 7, 1), range(4))

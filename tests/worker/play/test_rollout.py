@@ -100,19 +100,6 @@ def test_episodes_equal_a_naive_loop_however_they_are_batched(
                 )
 
 
-@pytest.mark.parametrize("position", range(4))
-def test_each_part_of_the_identity_gives_other_episodes(position: int) -> None:
-    made = setup()
-    other = list(IDENTITY)
-    other[position] = "evaluator" if position == 1 else IDENTITY[position] + 1
-    with environment(made) as env:
-        one, two = (
-            Rollout(env, made.spec, *who).play(policy(made).actor.act) for who in (IDENTITY, other)
-        )
-    assert not np.isclose(one["goals"], two["goals"]).any(axis=(1, 2)).all()
-    assert not np.isclose(one["corners"][:, 0], two["corners"][:, 0]).any(axis=(1, 2)).all()
-
-
 @pytest.mark.parametrize(("size", "counts"), [(5, [5, 5, 2]), (12, [12]), (40, [12]), (4, [4] * 3)])
 def test_messages_are_parts_of_the_record_in_order(size: int, counts: list[int]) -> None:
     episodes = rolled_out(setup(), envs=4, count=12)

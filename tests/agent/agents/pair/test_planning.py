@@ -138,20 +138,6 @@ def test_the_best_of_all_is_played(
         np.testing.assert_allclose(choice.velocity[row], way.clip(-1.0, 1.0), atol=1e-5)
 
 
-@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}])
-def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]) -> None:
-    made = seven({"reapply": 1}, **sim)
-    chooser = planner(random_networks(made), made)
-    corners, placed, goals = scenes(made, COUNT)
-    placed[3] = True
-    together = chosen(chooser, corners, placed, goals)
-    for row in range(COUNT):
-        one = slice(row, row + 1)
-        alone = chosen(chooser, corners[one], placed[one], goals[one])
-        for name, column in vars(alone).items():
-            np.testing.assert_allclose(column[0], vars(together)[name][row], atol=1e-5)
-
-
 def test_no_placed_token_is_named_while_others_are_left() -> None:
     made = seven()
     corners, placed, goals = scenes(made, 40)
