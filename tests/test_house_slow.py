@@ -21,10 +21,8 @@ from packaging.utils import canonicalize_name
 
 from tests.blocks import PAGES
 from tests.conftest import (
-    NO_BROWSER,
     SECONDS,
     pytest_collection_modifyitems,
-    pytest_terminal_summary,
 )
 from tests.test_house import ROOT, locked, run, run_python
 
@@ -116,16 +114,6 @@ def test_the_longest_tests_are_there_and_come_first() -> None:
     ]
     pytest_collection_modifyitems(mock.Mock(**{"option.markexpr": ""}), items)
     assert [item.nodeid for item in items[:1] + items[-1:]] == [next(iter(SECONDS)), "other"]
-
-
-def test_what_was_not_run_in_a_browser_is_told() -> None:
-    skipped = [
-        mock.Mock(longrepr=("test.py", 1, f"Skipped: {why}")) for why in ("no GPU", NO_BROWSER)
-    ]
-    reporter = mock.Mock(stats={"skipped": skipped})
-    list(pytest_terminal_summary(reporter))
-    (line,) = reporter.write_line.call_args.args
-    assert line == "NOT RUN: 1 tests in a browser. Install it: sudo apt-get install chromium"
 
 
 # What is installed

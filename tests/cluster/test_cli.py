@@ -82,7 +82,6 @@ def test_help_config_and_version_are_shown_and_leave_nothing_behind(
 WRONG = [
     ("tangram-train sed=1", "unknown setting 'sed' (did you mean 'seed'?)"),
     ("tangram-train noise=1", "unknown setting 'noise' (did you mean 'agent.noise'?)"),
-    ("tangram-train agent.gama=0", "unknown setting 'agent.gama' (did you mean 'agent.gamma'?)"),
     ("tangram-train sim.observe=silhouette", "is for an agent of outlines: train one"),
     ("tangram-train +~zzz", "cannot read '+~zzz'"),
     ("tangram-train zzz=1", "unknown setting 'zzz' (--help and --cfg job list them)"),
@@ -97,8 +96,6 @@ WRONG = [
         "tangram-train agent=best",
         "unknown agent 'best': choose from goal, goal_large, mlp, outline, paper, push, quick, t",
     ),
-    ("tangram-train tokens=pentagon", "unknown tokens 'pentagon': choose from hexagon, large_tri"),
-    ("tangram-train tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
     ("tangram-train seed=abc", "seed must be a whole number, got abc"),
     ("tangram-train run_dir=", "run_dir must name a folder"),
     (
@@ -110,10 +107,7 @@ WRONG = [
         "run_dir must be a path of at most 3840 bytes, 255 in",
     ),
     (f"tangram-play run_dir={'x/' * 2000}", "run_dir must be a path of at most 3840 bytes"),
-    ("tangram-train service.bind=", "without scheme and port, got '': set service.bind=127.0.0.1"),
-    ("tangram-train service.port=5555", "service.port=5555 changes nothing with service.bind="),
     ("tangram-master +sim.colour=1", "there is no setting sim.colour: delete it"),
-    ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-master tokens.scale=1000", "does not fit into an arena of width 2"),
@@ -124,15 +118,11 @@ WRONG = [
     ),
     ("tangram-master run_dir=/proc/tangram", "run_dir /proc/tangram cannot be made"),
     ("tangram-worker", "say which run: connect=runs/..., or connect= a copy"),
-    ("tangram-worker connect=tcp://127.0.0.1:99999", "port from 1 to 65535"),
     ("tangram-status connect=tcp://127.0.0.1:65536", "port from 1 to 65535"),
     ("tangram-eval run_dir=pretrained/square puzzle=test", "puzzle 'trapezoid' has the pieces"),
     ("tangram-eval run_dir=pretrained/square sim.mirrored=0.5", "sim.mirrored"),
     ("tangram-eval run_dir=pretrained/square out=..", "cannot be written (it is a folder): name"),
-    ("tangram-eval run_dir=pretrained/square out=/proc/no/a.json", "out=/proc/no/a.json cannot be"),
     ("tangram-play run_dir=pretrained/square out=/proc/a.gif", "out=/proc/a.gif cannot be written"),
-    ("tangram-play runs_dir=x", "unknown setting 'runs_dir' (did you mean 'run_dir'?)"),
-    ("tangram-play run_dir=pretrained/nobody", "no pretrained agent 'nobody': choose from"),
 ]
 
 

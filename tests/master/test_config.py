@@ -18,14 +18,9 @@ pytestmark = pytest.mark.fast
         ({"run_dir": " "}, "run_dir must name a folder, got ' ': set run_dir=runs/my_run"),
         ({"run_dir": "a\nb"}, r"without line breaks and .* got 'a\\nb': set run_dir=runs/my_run"),
         ({"run_dir": "a\0b"}, r"got 'a\\x00b': set run_dir=runs/my_run"),
-        ({"seed": -1}, "seed must be between 0 and"),
-        ({"max_hours": -0.5}, "max_hours must be at least 0, got -0.5"),
         ({"max_hours": float("nan")}, "max_hours must be a finite number, at least 0, got nan"),
-        ({"max_episodes": -1}, "max_episodes must be at least 0, got -1"),
-        ({"max_updates": -1}, "max_updates must be at least 0, got -1"),
-        ({"resume": "maybe"}, "resume must be one of none, auto, got 'maybe'"),
+        ({"seed": -1}, "seed must be between 0 and"),
         ({"workers": 0}, "workers must be at least 1, got 0: a run needs a player"),
-        ({"workers": 1025}, "workers must be between 1 and 1024, got 1025"),
     ],
 )
 def test_wrong_settings_are_refused(settings: dict[str, Any], reason: str) -> None:

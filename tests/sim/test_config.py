@@ -63,8 +63,6 @@ REFUSED = [
     (NoiseConfig, {"blur": 0.5, "share": 0.0}, f"^noise.blur=0.5 .* noise.share=0: {BLURRED}"),
     (TopConfig, {"jobs": 0}, "^jobs must be at least 1, got 0$"),
     (SimConfig, {"backend": "x"}, "sim.backend must be one of physics, kinematic, got 'x'"),
-    (SimConfig, {"arena": 0.0}, "sim.arena must be between 0.001 and 1000"),
-    (SimConfig, {"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
     (SimConfig, {"pixels": 15}, "sim.pixels must be 0 or at least 16, got 15"),
     (SimConfig, {"observe": "pictures"}, "^sim.observe=pictures needs .*: set sim.pixels=128$"),
     (
@@ -72,9 +70,6 @@ REFUSED = [
         {"observe": "pictures", "pixels": 64, "view": 2.0},
         "needs pictures of the arena, got sim.view=2: set sim.view=1",
     ),
-    (SimConfig, {"targets": "x"}, "sim.targets must be one of uniform, .* touching, got 'x'"),
-    (SimConfig, {"starts": "x"}, "sim.starts must be one of anywhere, outside, got 'x'"),
-    (SimConfig, {"mirrored": 2.0}, "sim.mirrored must be between 0 and 1, got 2"),
     (RewardConfig, {"name": "x"}, "overlap, dense or path/to/file.py:function, got 'x'"),
     (RewardConfig, {"name": ":function"}, "got ':function'"),
     (RewardConfig, {"name": "file.py:"}, "got 'file.py:'"),

@@ -20,28 +20,16 @@ RUN = {"run_dir": "runs/one"}
 TESTED = RUN | {"puzzle": ("test",)}
 OF_A_RUN = [
     ({"run_dir": ""}, "set run_dir=runs/my_run"),
-    ({"episodes": 0}, "episodes must be between 1 and"),
-    ({"episodes": 1_000_001}, "episodes must be between 1 and"),
-    ({"seed": -1}, "seed must be between 0 and"),
     ({"seed": 2**63}, "seed must be between 0 and"),
 ]
 WRONG = {
     WorkerConfig: [
         ({"connect": " "}, "set connect=RUN_DIR"),
         ({"role": "dancer"}, "role must be one of player, evaluator, got 'dancer'"),
-        ({"index": -2}, "index must be between -1 and 65535, got -2"),
-        ({"index": 65536}, "index must be between -1 and 65535, got 65536"),
     ],
     EvalConfig: [
         *OF_A_RUN,
         *[({"out": out}, "out must name a file") for out in ("", "/", ".")],
-        (TESTED | {"turns": 0}, "turns must be between 1 and 360, got 0"),
-        (TESTED | {"turns": 361}, "turns must be between 1 and 360, got 361"),
-        (TESTED | {"episodes": 5}, "episodes=5 changes nothing with puzzle=[test]: leave it at"),
-        *[
-            ({name: value}, f"{name}={shown} changes nothing with puzzle=null: leave it")
-            for name, value, shown in (("turns", 2, "2"),)
-        ],
         *[
             (TESTED | {"changes": {"sim": {name: 1}}}, f"sim.{name}=1 changes nothing with puzzle:")
             for name in ("targets", "mirrored")
@@ -51,11 +39,9 @@ WRONG = {
         *OF_A_RUN,
         *[
             ({"out": out}, "out must end with .gif, .mp4, .png, .json, .svg, got")
-            for out in ("film.webm", "film", "", "gif", "film.GIF.txt")
+            for out in ("film.webm", "film.GIF.txt")
         ],
         ({"run_dir": None}, "say which run: run_dir=runs/..."),
-        ({"turns": 2}, "turns=2 changes nothing with puzzle=null"),
-        ({"puzzle": ("cat",), "episodes": 5}, "episodes=5 changes nothing with puzzle=[cat]"),
         *[
             (
                 {"puzzle": ("cat",), "changes": {"sim": {name: 1}}},
@@ -63,7 +49,6 @@ WRONG = {
             )
             for name in ("targets", "mirrored", "starts")
         ],
-        ({"run_dir": " "}, "run_dir must name"),
     ],
 }
 CASES = [(kind, *case) for kind, cases in WRONG.items() for case in cases]
@@ -139,6 +124,7 @@ def test_paths_are_seen_from_the_callers_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
     (tmp_path / "pretrained" / "mine").mkdir(parents=True)
     for name, given, seen in (
         ("run_dir", None, None),
@@ -151,6 +137,9 @@ def test_paths_are_seen_from_the_callers_folder(
         ("puzzle", ["mine.json", "cat"], (f"{tmp_path}/mine.json", "cat")),
         ("puzzle", "test", ("test",)),
         ("puzzle", ["cat", 8], ("cat", "8")),
+        ("silhouette", "it.svg", f"{tmp_path}/it.svg"),
+        ("silhouette", "~/it.png", f"{tmp_path}/home/it.png"),
+        ("silhouette", "cat", "cat"),
     ):
         assert with_absolute_paths({name: given}) == {name: seen}
 

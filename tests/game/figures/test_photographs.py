@@ -114,7 +114,6 @@ def crowd() -> Floats:
 
 
 REFUSED = {
-    "nothing": (np.full((200, 300), 200.0), "shows nothing that is darker or lighter than its "),
     "crowd": (crowd(), f"shows more than 40 areas, and the run moves {NAMES}: lay them all "),
     "one": (
         levels(layout_of("square"), POSES[:1]),
@@ -178,10 +177,6 @@ def test_what_was_seen_is_drawn_before_the_film(tmp_path: Path) -> None:
 
 
 def test_a_photograph_is_instead_of_other_targets() -> None:
-    with pytest.raises(ConfigError, match="^episodes=3 changes nothing with target=it.png: "):
-        PlayConfig("pretrained/square", target="it.png", episodes=3)
-    with pytest.raises(ConfigError, match=r"^target=it.png changes nothing with puzzle=\[cat\]: "):
-        PlayConfig("pretrained/square", target="it.png", puzzle=("cat",))
     with pytest.raises(ConfigError, match="^sim.targets=uniform changes nothing with target: "):
         PlayConfig(target="it.png", changes={"sim": {"targets": "uniform"}})
     assert PlayConfig(target="it.png").run == "pretrained/tangram7"

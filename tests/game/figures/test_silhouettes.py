@@ -12,7 +12,6 @@ from PIL import Image, ImageDraw
 
 from tangram_agent.runs import load_run
 from tangram_core.errors import ConfigError
-from tangram_game.cli import with_absolute_paths
 from tangram_game.config import EvalConfig, PlayConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.silhouettes import read_silhouette
@@ -133,7 +132,7 @@ def test_an_agent_of_outlines_is_shown_the_bare_silhouette(
     filler: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its two halves are of few colours: those of the tokens are on the right side only."""
-    out, name = tmp_path / "square.png", svg(tmp_path / "square.svg", SQUARE)
+    out, name = tmp_path / "out.png", picture(tmp_path / "it.png")
     play_run(PlayConfig(str(filler), silhouette=name, out=str(out)))
     assert "; not filled by the run itself, but filled by the search in" in capsys.readouterr().out
     with Image.open(out) as drawn:
@@ -142,31 +141,12 @@ def test_an_agent_of_outlines_is_shown_the_bare_silhouette(
     assert wide.max() < 40  # nothing is of a token's colour
 
 
-def test_an_agent_of_outlines_fills_what_a_picture_shows(filler: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.png"
-    play_run(PlayConfig(str(filler), silhouette=picture(tmp_path / "it.png"), out=str(out)))
-    assert out.exists()
-
-
 def test_a_puzzle_file_of_one_is_filled(tmp_path: Path) -> None:
     content = json.loads((PACKAGED / "test.json").read_text())
     one = content | {"puzzles": content["puzzles"][:1]}
     (tmp_path / "1.json").write_text(json.dumps(one))
     shown = read_silhouette(str(tmp_path / "1.json"), "it", load_run("pretrained/tangram7").task)
     assert float(shown.told.split()[-1]) > 0.97
-
-
-def test_a_file_is_named_from_where_the_command_was_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    for given, meant in (
-        ("it.svg", str(tmp_path / "it.svg")),
-        ("~/it.png", str(tmp_path / "home" / "it.png")),
-        ("cat", "cat"),
-    ):
-        assert with_absolute_paths({"silhouette": given})["silhouette"] == meant
 
 
 def test_a_figure_that_is_cut_off_is_refused(tmp_path: Path) -> None:
@@ -199,8 +179,6 @@ def test_what_fills_a_picture_badly_does_not_fill_it(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"puzzle": ("cat",)}, "silhouette"),
-        ({"target": "photo.png"}, "silhouette"),
         ({"out": "cat.png", "silhouette": "cat.png"}, "overwrite silhouette"),
         ({"changes": {"sim": {"targets": "uniform"}}}, "leave silhouette out"),
     ],

@@ -10,7 +10,7 @@ import pytest
 from master.checkpointer import Restored, restore_run, save_run, warm_start
 from master.learn.trainer import Trainer, choose_device
 from master.record.journal import Place, segments
-from master.record.resumable import check_resumable, check_same_task
+from master.record.resumable import check_resumable
 from master.record.rundir import Record, RunFolder
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.setup import Setup
@@ -185,13 +185,6 @@ def test_another_task_is_refused_before_anything_is_read_but_what_is_there(tmp_p
     check_resumable(folder, MINE | {"agent": MINE["agent"] | {"noise": 0.5}})
     with pytest.raises(RunError, match="made with other settings of tokens: .* from_config="):
         check_resumable(folder, OTHER)
-
-
-def test_networks_that_would_mean_something_else_are_not_gone_on_with() -> None:
-    made, other = (seven({}, PERCEPTRON, arena=arena) for arena in (2.0, 3.0))
-    check_same_task(made, made.contents())
-    with pytest.raises(RunError, match="other settings of sim: resume it with its own"):
-        check_same_task(other, made.contents())
 
 
 # A warm start

@@ -160,8 +160,6 @@ def test_filled_is_surer_than_any_value() -> None:
     ("agent", "sim", "reason"),
     [
         ({}, {"observe": "corners"}, "shows outlines, got sim.observe=corners: set sim=silhouette"),
-        ({"noise": 0.2}, {}, "no setting agent.noise"),
-        ({"copies": 0}, {}, "agent.copies must be between 1 and 64, got 0"),
         ({}, {"starts": "anywhere"}, r"sim.starts=anywhere: .* set sim.starts=outside"),
         ({}, {"actions_per_token": 2}, r"actions_per_token=2: .* set sim.actions_per_token=1"),
     ],

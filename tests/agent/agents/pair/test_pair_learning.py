@@ -61,12 +61,6 @@ def test_the_losses_by_hand(case: str) -> None:
     assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 1.0).square().mean().item())
 
 
-def test_with_several_tokens_nothing_is_bootstrapped() -> None:
-    learner = learner_of(seven(**CASES["mlp"]), 0)
-    assert not learner.bootstraps
-    assert set(learner.parts) == {"actor", "critic", "acting"}
-
-
 def test_noise_on_the_corners_does_no_harm() -> None:
     made = seven(**CASES["mlp"])
     learner, batch = learner_of(made, 0), transitions(made, 64)
