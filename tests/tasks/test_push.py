@@ -316,13 +316,13 @@ def test_the_middle_of_a_row_comes_before_its_second_end(scale: float) -> None:
     assert found.tolist() == [False, True, True]  # the last lies in the middle
 
 
-def test_weights_of_more_tokens_than_there_are_are_for_learning_alone() -> None:
+def test_odds_of_more_tokens_than_there_are_are_for_learning_alone() -> None:
     two = Push(TokensConfig(SEVEN, 0.6), PushConfig(count=2, fewer=(0.0, 0.0, 1.0)))
     two.check(plays=True)
     with closing(two.make(2)) as env:
         seen = env.reset(generators(2))
     assert (on_table(seen["goals"], two.layout).sum(axis=1) == 2).all()
-    with pytest.raises(ConfigError, match="task.fewer=.0,0,1. must have at most 2 weights"):
+    with pytest.raises(ConfigError, match="task.fewer=.0,0,1. must have at most 2 odds"):
         two.check(plays=False)
 
 
