@@ -1,10 +1,15 @@
-"""Checks a command's arguments before hydra reads them, and refuses what hydra would misread."""
+"""Checks a command's arguments and presets before hydra reads them, and explains hydra's errors."""
 
+import difflib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import yaml
+
 from conf.commands import COMMANDS, GROUPS
-from conf.help import choices
+from conf.help import choices, setting_names
+from conf.kinds import Kinds
 from tangram_core.errors import ConfigError
 
 CFG_KINDS = ("job", "hydra", "all")
@@ -36,6 +41,39 @@ def without_own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]
                 "tangram-rl: rename it"
             )
     return str(folder), rest[: at[0]] + rest[at[0] + 2 :]
+
+
+def check_presets(folder: str | None) -> None:
+    """Raise ConfigError for a broken or empty preset in the user's folder."""
+    if folder is None:
+        return
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from tangram_core.store.stored import check_extent
+
+    if Path(folder, "hydra").exists():
+        raise ConfigError(f"{OWN_PRESETS[0]}: {folder}/hydra sets hydra's own settings: remove it")
+    for path in (path for group in GROUPS for path in Path(folder, group).rglob("*.yaml")):
+        try:
+            check_extent(path.read_text(encoding="utf-8"), f"preset {path}")
+            content = OmegaConf.to_container(OmegaConf.load(path))
+        except (
+            OSError,
+            ValueError,
+            RecursionError,
+            yaml.YAMLError,
+            OmegaConfBaseException,
+        ) as error:
+            why = " ".join(str(error).split()) or type(error).__name__
+            raise ConfigError(f"preset {path} cannot be read ({why}): correct it") from None
+        if not (content and isinstance(content, dict)):
+            raise ConfigError(f"preset {path} sets nothing: write settings as in name: value")
+        # Hydra's settings may name functions, which hydra calls.
+        if "hydra" in str(content) or "@package" in path.read_text(encoding="utf-8"):
+            raise ConfigError(
+                f"preset {path} sets more than its group: leave hydra and @package out"
+            )
 
 
 def options_first(arguments: Sequence[str], config_name: str) -> list[str]:
@@ -95,9 +133,45 @@ def _check_override(override: str, over: Sequence[str]) -> None:
         raise ConfigError(f"{name} takes one preset, got {value}{remedy}")
 
 
+def explained(error: Exception, config_name: str, kinds: Kinds) -> str:
+    """The error text for a wrong command line, with a remedy."""
+    from hydra.errors import MissingConfigException, OverrideParseException
+
+    if isinstance(error, MissingConfigException):
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        known = error.options or choices(group)
+        return f"unknown {group} '{name}': choose from {', '.join(known)}"
+    if isinstance(error, OverrideParseException):
+        return unreadable(error.override)
+    if isinstance(error, RecursionError):
+        return "the arguments are nested too deeply: write fewer brackets"
+    if str(error).startswith("Config group override must be"):
+        return "a config group takes the name of a preset, not a number: --help lists them"
+    if "Ambiguous value" in str(error):
+        return f"{first_line(error)}: write [1,2] for a list, '1,2' for a text, --multirun for runs"
+    unknown = re.search(r"Could not override '([^']+)'|'([^']+)' does not exist", str(error))
+    if unknown:
+        name = unknown.group(1) or unknown.group(2)
+        return _unknown_setting(name, setting_names(config_name, kinds))
+    return first_line(error)
+
+
 def unreadable(override: object) -> str:
     """The error text for an argument that is not name=value."""
     return f"cannot read '{override}': write name=value, and quote texts with '...'"
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error text."""
+    return str(error).strip().partition("\n")[0]
+
+
+def _unknown_setting(name: str, known: Sequence[str]) -> str:
+    same_ending = [key for key in known if key.rpartition(".")[2] == name]
+    close = same_ending or difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean '{close[0]}'?" if close else "--help and --cfg job list them"
+    hint = "a trained run keeps its own" if name in GROUPS else hint
+    return f"unknown setting '{name}' ({hint})"
 
 
 def _split_option(argument: str) -> list[str]:

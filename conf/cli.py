@@ -3,10 +3,8 @@
 Nothing heavy is loaded before the command line is checked, so --help is instant.
 """
 
-import difflib
 import gc
 import os
-import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -18,12 +16,14 @@ import yaml
 
 from conf.arguments import (
     OWN_PRESETS,
+    check_presets,
+    explained,
+    first_line,
     options_first,
-    unreadable,
     without_own_presets,
 )
 from conf.commands import COMMANDS, GROUPS, Plain
-from conf.help import choices, group_help, help_text, setting_names
+from conf.help import group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of, with_usual_agent
 from conf.own import with_named_code, without_named_code
 from tangram_core.errors import (
@@ -92,7 +92,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
             known = setting_names(config_name, kinds)
             arguments = [a for a in arguments if not names_modules(_key(a)) or _key(a) in known]
         options = [] if folder is None else [OWN_PRESETS[0], folder]
-        _check_presets(folder)
+        check_presets(folder)
         sys.argv[1:] = [*options, *options_first(arguments, config_name)]
         return _run(config_name, task, stored, kinds)
     except TangramError as error:
@@ -120,39 +120,6 @@ def with_absolute(settings: Plain, *names: str) -> Plain:
     texts = {name: settings.get(name) for name in names}
     found = {n: text for n, text in texts.items() if isinstance(text, str) and text.strip()}
     return settings | {n: str(Path(text).expanduser().absolute()) for n, text in found.items()}
-
-
-def _check_presets(folder: str | None) -> None:
-    """Raise ConfigError for a broken or empty preset in the user's folder."""
-    if folder is None:
-        return
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    from tangram_core.store.stored import check_extent
-
-    if Path(folder, "hydra").exists():
-        raise ConfigError(f"{OWN_PRESETS[0]}: {folder}/hydra sets hydra's own settings: remove it")
-    for path in (path for group in GROUPS for path in Path(folder, group).rglob("*.yaml")):
-        try:
-            check_extent(path.read_text(encoding="utf-8"), f"preset {path}")
-            content = OmegaConf.to_container(OmegaConf.load(path))
-        except (
-            OSError,
-            ValueError,
-            RecursionError,
-            yaml.YAMLError,
-            OmegaConfBaseException,
-        ) as error:
-            why = " ".join(str(error).split()) or type(error).__name__
-            raise ConfigError(f"preset {path} cannot be read ({why}): correct it") from None
-        if not (content and isinstance(content, dict)):
-            raise ConfigError(f"preset {path} sets nothing: write settings as in name: value")
-        # Hydra's settings may name functions, which hydra calls.
-        if "hydra" in str(content) or "@package" in path.read_text(encoding="utf-8"):
-            raise ConfigError(
-                f"preset {path} sets more than its group: leave hydra and @package out"
-            )
 
 
 def _run(
@@ -194,7 +161,7 @@ def _run(
         RecursionError,
         yaml.YAMLError,
     ) as error:
-        raise ConfigError(_explain(error, config_name, kinds)) from error
+        raise ConfigError(explained(error, config_name, kinds)) from error
     except SystemExit:
         if not errors:
             raise
@@ -246,7 +213,7 @@ def _plain(config: Any, stored: Stored | None, config_name: str, kinds: Kinds) -
         missing = sorted(OmegaConf.missing_keys(config))
         settings = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
-        raise ConfigError(f"cannot resolve the config: {_first_line(error)}") from None
+        raise ConfigError(f"cannot resolve the config: {first_line(error)}") from None
     if missing:
         raise ConfigError(MISSING_HINTS.get(missing[0], f"set {missing[0]}=..., it has no default"))
     overrides = list(HydraConfig.get().overrides.task)
@@ -280,7 +247,7 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
             config = hydra.compose(config_name, list(overrides))
         return _own(_mapping(OmegaConf.to_container(config, resolve=True)), overrides, kinds)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_explain(error, config_name, kinds)) from error
+        raise ConfigError(explained(error, config_name, kinds)) from error
 
 
 def _own(settings: Plain, overrides: Sequence[str], kinds: Kinds) -> Plain:
@@ -421,43 +388,3 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
     except UnicodeDecodeError:
         raise ConfigError(f"{source} is not UTF-8: save it as UTF-8") from None
     return source, content if isinstance(content, dict) else {}
-
-
-# Errors of the command line in one line
-
-
-def _explain(error: Exception, config_name: str, kinds: Kinds) -> str:
-    """The error text for a wrong command line, with a remedy."""
-    from hydra.errors import MissingConfigException, OverrideParseException
-
-    if isinstance(error, MissingConfigException):
-        group, _, name = str(error.missing_cfg_file).rpartition("/")
-        known = error.options or choices(group)
-        return f"unknown {group} '{name}': choose from {', '.join(known)}"
-    if isinstance(error, OverrideParseException):
-        return unreadable(error.override)
-    if isinstance(error, RecursionError):
-        return "the arguments are nested too deeply: write fewer brackets"
-    if str(error).startswith("Config group override must be"):
-        return "a config group takes the name of a preset, not a number: --help lists them"
-    if "Ambiguous value" in str(error):
-        return (
-            f"{_first_line(error)}: write [1,2] for a list, '1,2' for a text, --multirun for runs"
-        )
-    unknown = re.search(r"Could not override '([^']+)'|'([^']+)' does not exist", str(error))
-    if unknown:
-        name = unknown.group(1) or unknown.group(2)
-        return _unknown_setting(name, setting_names(config_name, kinds))
-    return _first_line(error)
-
-
-def _unknown_setting(name: str, known: Sequence[str]) -> str:
-    same_ending = [key for key in known if key.rpartition(".")[2] == name]
-    close = same_ending or difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean '{close[0]}'?" if close else "--help and --cfg job list them"
-    hint = "a trained run keeps its own" if name in GROUPS else hint
-    return f"unknown setting '{name}' ({hint})"
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
