@@ -104,6 +104,7 @@ class Ddpg(TokenLearner):
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:
         """Add the played and the relabelled transitions; see `Learner.insert`."""
+        self.put_back()
         seen, task = learnable(episodes), self.task
         if seen.count:
             relabelled = self.relabels, task.layout, task.reward_of, rng["hindsight"]

@@ -5,7 +5,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, NoReturn, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol, cast
 
 import numpy as np
 import torch
@@ -46,6 +46,15 @@ class Loss:
     told: Mapping[str, Tensor] = field(default_factory=dict)
 
 
+class Ahead(NamedTuple):
+    """What an update was given before its turn: its batch, and the generators' states before."""
+
+    seen: Any
+    batch: Any
+    rng: Streams
+    states: dict[str, Any]
+
+
 class Replay(Protocol):
     """A replay buffer that a checkpoint can save and load."""
 
@@ -68,6 +77,7 @@ class NetworkLearner(Learner):
         lists: parameters of each network: collecting them takes a fifth of a small update.
         optimisers: optimisers of the learned networks, by their names in `parts`.
         names: names of an update's numbers: True with a step of the actor, False without.
+        draws_ahead: whether a batch is drawn while the device computes the update before it.
     """
 
     compiles = True
@@ -110,6 +120,7 @@ class NetworkLearner(Learner):
         }
         self.optimisers = {name: Adam(self.lists[name]) for name in learned}
         self.names: dict[bool, tuple[str, ...]] = {}
+        self.draws_ahead, self._ahead = self.place.type == "cuda", cast("Ahead | None", None)
         self._whole: Callable[[Any, Rates], Tensor] = self.step
         self._traced = compiled
         if self.compiles and (compiled or self.place.type == "cuda"):
@@ -144,14 +155,19 @@ class NetworkLearner(Learner):
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
         """See `Learner.update`; the numbers are those of `learn`."""
-        return self.learn(self.drawn(rng), share)
+        if self._ahead is None:
+            seen = self.drawn(rng)
+        else:
+            seen, self.batch, self._ahead = self._ahead.seen, self._ahead.batch, None
+        return self.learn(seen, share, rng if self.draws_ahead else None)
 
-    def learn(self, seen: Any, share: float = 0.0) -> dict[str, float]:
+    def learn(self, seen: Any, share: float = 0.0, rng: Streams | None = None) -> dict[str, float]:
         """Make one step of all networks.
 
         Args:
             seen: a batch from `drawn`.
             share: used share of the run's budget, in [0, 1]; sets the learning rates.
+            rng: generators to draw the next batch with, while the device computes; None: do not.
 
         Returns:
             NAME_loss and NAME_gradient (the norm) of each network, and what its loss told.
@@ -161,12 +177,28 @@ class NetworkLearner(Learner):
         """
         found = self._whole(seen, self.rates(share))  # only tolist() below waits for it
         names = self.names[getattr(seen, "acts", True)]
+        self.updates += 1
+        if rng is not None:
+            batch, states = self.batch, {name: g.bit_generator.state for name, g in rng.items()}
+            following = self.drawn(rng)
+            self._ahead, self.batch = Ahead(following, self.batch, rng, states), batch
         numbers = dict(zip(names, found.tolist(), strict=True))
         if not all(map(math.isfinite, numbers.values())):
+            self.put_back()
+            self.updates -= 1
             listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
             raise NotFiniteError(f"update {self.updates + 1} is not finite ({listed})")
-        self.updates += 1
         return numbers
+
+    def put_back(self) -> None:
+        """Undo a drawing ahead, generators included: so it changes no number of a run.
+
+        It comes before each change of the replay buffer, and before a state is saved or loaded.
+        """
+        if self._ahead is not None:
+            for name, generator in self._ahead.rng.items():
+                generator.bit_generator.state = self._ahead.states[name]
+            self._ahead = None
 
     def step(self, seen: Any, rates: Rates) -> Tensor:
         """Make the whole update on the device; returns its numbers in the order of `names`."""
@@ -217,7 +249,10 @@ class NetworkLearner(Learner):
 
     def tensor(self, array: Array, dtype: type = np.float32) -> Tensor:
         """A tensor of an array, on the device."""
-        return torch.from_numpy(np.asarray(array, dtype)).to(self.place)
+        made = torch.from_numpy(np.asarray(array, dtype))
+        if self.place.type == "cuda":  # from pageable memory it would wait for the last update
+            made = made.pin_memory()
+        return made.to(self.place, non_blocking=True)
 
     # State
 
@@ -240,6 +275,7 @@ class NetworkLearner(Learner):
 
     def state(self) -> dict[str, Array]:
         """Networks, optimisers and the number of updates, for a checkpoint."""
+        self.put_back()
         state: dict[str, Array] = {_COUNTER: np.array([self.updates], np.int64)}
         for part, module in self.parts.items():
             state |= {f"{part}.{name}": value for name, value in to_arrays(module).items()}
@@ -273,6 +309,7 @@ class NetworkLearner(Learner):
         Raises:
             RunError: tensors are missing or have other shapes.
         """
+        self.put_back()
         for part, module in self.parts.items():
             load_arrays(module, under(f"{part}.", state))
 

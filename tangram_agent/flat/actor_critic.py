@@ -125,6 +125,7 @@ class ActorCritic(NetworkLearner, Generic[Config]):
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
         """Add whole episodes; their goals are relabelled when a batch is drawn."""
+        self.put_back()
         self._normaliser.add(self._inputs.of_episodes(episodes))
         self._settle()
         self.replay.add(episodes)
@@ -134,9 +135,9 @@ class ActorCritic(NetworkLearner, Generic[Config]):
         """The same constant learning rate for all networks."""
         return Rates(self.config.learning_rate, self.config.learning_rate, 0.0)
 
-    def learn(self, seen: Any, share: float = 0.0) -> dict[str, float]:
+    def learn(self, seen: Any, share: float = 0.0, rng: Streams | None = None) -> dict[str, float]:
         """See `NetworkLearner.learn`; refuse losses that leave a network out."""
-        numbers = super().learn(seen, share)
+        numbers = super().learn(seen, share, rng)
         if len(self.names) == min(self.delay, 2):  # each form of an update was made
             found = {name for names in self.names.values() for name in names}
             for name in self.optimisers:

@@ -20,6 +20,7 @@ examples:
   tangram-bench all out=bench.json          learner and scaling (make bench)
   tangram-bench fetch id=PandaPush-v3 minutes=60    ours and Stable-Baselines3 side by side
   tangram-bench fetch seeds=3 rows=fetch.csv    five tasks; the same command again continues
+  tangram-bench gpu profile=true            recorded updates, and what a second of them does
   tangram-bench chaos minutes=20 seed=1     random faults in a real training
   tangram-bench attack out=attack.json      all known attacks on real trainings
 """
@@ -55,6 +56,9 @@ def _parser() -> argparse.ArgumentParser:
         one = kinds.add_parser(name, help=text, description=text)
         one.add_argument("--runs", type=int, default=5, help="measurements of each rate (5)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
+        if name == "gpu":
+            about = "true: write timeline.json, a second of updates for Chrome's tracing (false)"
+            one.add_argument("--profile", choices=("true", "false"), default="false", help=about)
         if name == "fetch":
             one.add_argument("--id", help="gymnasium id of one task (five of Fetch and Panda)")
             one.add_argument("--minutes", type=float, default=60.0, help="per training (60)")

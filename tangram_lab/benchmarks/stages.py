@@ -16,7 +16,7 @@ STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
     "learner": lambda given: measure_learner(given.runs),
     "scaling": lambda given: measure_scaling(given.runs),
     "fetch": lambda given: measure_fetch(_matches(given), given.rows),
-    "gpu": lambda given: measure_gpu(given.runs),
+    "gpu": lambda given: measure_gpu(given.runs, profile=given.profile == "true"),
 }
 
 

@@ -41,6 +41,7 @@ class FillLearner(TokenLearner):
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:
         """Add played states and hindsight states to the replay buffer."""
+        self.put_back()
         return self.replay.insert(learnable(episodes), rng["hindsight"])
 
     def drawn(self, rng: Streams) -> FillBatch:

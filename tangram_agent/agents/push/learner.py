@@ -151,6 +151,7 @@ class PushLearner(NetworkLearner):
 
     def insert(self, episodes: Episodes, rng: Streams) -> int:  # noqa: ARG002
         """Add whole episodes; their goals are relabelled when a batch is drawn."""
+        self.put_back()
         self.replay.add(episodes)
         return int(episodes.lengths.sum())
 

@@ -14,7 +14,7 @@ from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.base.ddpg import Ddpg
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
-from tangram_lab.benchmarks.measure import Row, Work, rates, row_of
+from tangram_lab.benchmarks.measure import Row, Work, rate, rates, row_of
 from tangram_lab.benchmarks.setups import (
     goal_config,
     played,
@@ -28,7 +28,8 @@ from tangram_lab.benchmarks.speed import still
 from tangram_lab.benchmarks.speed.fetch import label
 
 BATCHES = (64, 256)
-HIDDEN, SIZE, EPISODES = [256, 256, 256], 256, 320
+HIDDEN, SIZE, LARGE, EPISODES = [256, 256, 256], 256, 4096, 320
+TIMELINE = "timeline.json"  # in the current folder; Chrome's tracing and Perfetto show it
 
 
 def measure_learner(runs: int) -> list[Row]:
@@ -49,9 +50,7 @@ def measure_learner(runs: int) -> list[Row]:
 
 def _goal_rows(runs: int, name: str) -> list[Row]:
     """The goal agent with its sampling, compared with Stable-Baselines3 and the peak of a core."""
-    case = f"goal agent {HIDDEN}, batch {SIZE}"
-    sizes = f"agent.hidden={HIDDEN}", f"agent.batch_size={SIZE}"
-    setup = robot(still.ID, still.__name__, "agent=goal", *sizes)
+    case, setup = goal_case(SIZE)
     compiled = goal_updates(setup, compiled=True)
     left, right = torch.rand(SIZE, HIDDEN[0]), torch.rand(HIDDEN[0], HIDDEN[1])
 
@@ -73,9 +72,20 @@ def _goal_rows(runs: int, name: str) -> list[Row]:
     ]
 
 
-def goal_updates(setup: Setup, *, compiled: bool = False) -> Work:
+def goal_case(size: int) -> tuple[str, Setup]:
+    """The goal agent with batches of `size`: its name in the tables, and its setup."""
+    sizes = f"agent.hidden={HIDDEN}", f"agent.batch_size={size}"
+    case = f"goal agent {HIDDEN}, batch {size:,}"
+    return case, robot(still.ID, still.__name__, "agent=goal", *sizes)
+
+
+def goal_updates(
+    setup: Setup, device: str = "cpu", *, compiled: bool = False, single: bool = False
+) -> Work:
     """Work of the goal agent: updates with sampling from its replay buffer."""
-    made = setup.agent.learner(setup.task, 0, "cpu", compiled=compiled)
+    made: Any = setup.agent.learner(setup.task, 0, device, compiled=compiled)
+    if single:
+        made._whole = made.step
     rng = {stream: np.random.default_rng(i) for i, stream in enumerate(made.streams)}
     made.insert(played(setup, EPISODES), rng)
 
@@ -127,8 +137,12 @@ def sb3_updates(setup: Setup) -> Work:
     return work
 
 
-def measure_gpu(runs: int) -> list[Row]:
-    """Updates per second on a GPU, recorded as a CUDA graph, compared with three alternatives.
+def measure_gpu(runs: int, *, profile: bool = False) -> list[Row]:
+    """Updates per second on a GPU, recorded as a CUDA graph, compared with alternatives.
+
+    Args:
+        runs: measurements of each rate.
+        profile: whether to write TIMELINE, a second of the goal agent's updates.
 
     Raises:
         ConfigError: no GPU is visible.
@@ -148,6 +162,20 @@ def measure_gpu(runs: int) -> list[Row]:
         found, labels = rates(ways, runs), ("gpu", f"{name}, recorded", "updates/s")
         for against, least in zip([*ways][1:], (5.0, None, None), strict=True):
             rows.append(row_of(labels, found["ours"], against, found[against], least))
+        if name == f"ours, batch {BATCHES[0]}":
+            rows.append(row_of(labels, found["ours"], least=600.0))
+    for size in (SIZE, LARGE):
+        case, setup = goal_case(size)
+        ways = {"ours": goal_updates(setup, "cuda")}
+        ways["single operations on it"] = goal_updates(setup, "cuda", single=True)
+        found, labels = rates(ways, runs), ("gpu", f"{case}, recorded", "updates/s")
+        for against, theirs in [*found.items()][1:]:
+            rows.append(row_of(labels, found["ours"], against, theirs))
+    rows.append(row_of(labels, found["ours"], least=500.0))
+    if profile:
+        with torch.profiler.profile() as seen:
+            rate(ways["ours"], span_s=1.0)
+        seen.export_chrome_trace(TIMELINE)
     return rows
 
 
