@@ -5,7 +5,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, NoReturn, Protocol, cast
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import numpy as np
 import torch
@@ -120,7 +120,8 @@ class NetworkLearner(Learner):
         }
         self.optimisers = {name: Adam(self.lists[name]) for name in learned}
         self.names: dict[bool, tuple[str, ...]] = {}
-        self.draws_ahead, self._ahead = self.place.type == "cuda", cast("Ahead | None", None)
+        self.draws_ahead = self.place.type == "cuda"
+        self._ahead: Ahead | None = None
         self._whole: Callable[[Any, Rates], Tensor] = self.step
         self._traced = compiled
         if self.compiles and (compiled or self.place.type == "cuda"):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tangram_agent.agents.push.agent import Pushing, PushingConfig
 from tangram_core.agent import NotFiniteError
@@ -91,3 +92,8 @@ def test_an_update_that_fails_leaves_its_own_batch_and_generators() -> None:
         batch = {name: one.tolist() for name, one in made.evidence().items()}
         found.append((made.updates, batch, [one.bit_generator.state for one in rng.values()]))
     assert found[0] == found[1]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_draws_ahead() -> None:
+    assert learner(device="cuda").draws_ahead

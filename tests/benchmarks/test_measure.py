@@ -97,6 +97,17 @@ def test_what_needs_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.fast
+def test_a_timeline_that_cannot_be_written_is_told_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "timeline.json").mkdir()
+    with pytest.raises(ConfigError, match="timeline.json cannot be written"):
+        measure_gpu(1, profile=True)
+
+
+@pytest.mark.fast
 def test_all_is_all_that_needs_no_gpu_and_no_robots(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = []
     for name in STAGES:

@@ -3,6 +3,7 @@
 import importlib
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
@@ -14,6 +15,7 @@ from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.base.ddpg import Ddpg
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
+from tangram_core.store.files import check_writable
 from tangram_lab.benchmarks.measure import Row, Work, rate, rates, row_of
 from tangram_lab.benchmarks.setups import (
     goal_config,
@@ -29,7 +31,7 @@ from tangram_lab.benchmarks.speed.fetch import label
 
 BATCHES = (64, 256)
 HIDDEN, SIZE, LARGE, EPISODES = [256, 256, 256], 256, 4096, 320
-TIMELINE = "timeline.json"  # in the current folder; Chrome's tracing and Perfetto show it
+TIMELINE = Path("timeline.json")  # in the current folder; Chrome's tracing and Perfetto show it
 
 
 def measure_learner(runs: int) -> list[Row]:
@@ -145,10 +147,12 @@ def measure_gpu(runs: int, *, profile: bool = False) -> list[Row]:
         profile: whether to write TIMELINE, a second of the goal agent's updates.
 
     Raises:
-        ConfigError: no GPU is visible.
+        ConfigError: no GPU is visible, or TIMELINE cannot be written.
     """
     if not torch.cuda.is_available():
         raise ConfigError("gpu needs a GPU, and none is visible: use tangram-bench learner")
+    if profile:  # at once, not after minutes
+        check_writable("profile", TIMELINE.absolute())
     rows = []
     for name, made in gpu_cases().items():
         single = learner(made, "cuda")
@@ -164,18 +168,18 @@ def measure_gpu(runs: int, *, profile: bool = False) -> list[Row]:
             rows.append(row_of(labels, found["ours"], against, found[against], least))
         if name == f"ours, batch {BATCHES[0]}":
             rows.append(row_of(labels, found["ours"], least=600.0))
-    for size in (SIZE, LARGE):
+    for size, target in ((SIZE, None), (LARGE, 500.0)):
         case, setup = goal_case(size)
-        ways = {"ours": goal_updates(setup, "cuda")}
-        ways["single operations on it"] = goal_updates(setup, "cuda", single=True)
+        ours, against = goal_updates(setup, "cuda"), "single operations on it"
+        ways = {"ours": ours, against: goal_updates(setup, "cuda", single=True)}
         found, labels = rates(ways, runs), ("gpu", f"{case}, recorded", "updates/s")
-        for against, theirs in [*found.items()][1:]:
-            rows.append(row_of(labels, found["ours"], against, theirs))
-    rows.append(row_of(labels, found["ours"], least=500.0))
+        rows.append(row_of(labels, found["ours"], against, found[against]))
+        rows.append(row_of(labels, found["ours"], least=target))
     if profile:
         with torch.profiler.profile() as seen:
-            rate(ways["ours"], span_s=1.0)
-        seen.export_chrome_trace(TIMELINE)
+            rate(ours, span_s=1.0)
+        seen.export_chrome_trace(str(TIMELINE))
+        print(f"written: {TIMELINE}")
     return rows
 
 
