@@ -213,7 +213,7 @@ class Task(ABC):
         return None
 
     def plan(self, played: Played) -> Json | None:  # noqa: ARG002
-        """The first test episode as data for a machine that repeats it; None: there is none."""
+        """The first test episode as JSON, for a robot that repeats it; None: the task has none."""
         return None
 
     def pinned(self) -> Self:

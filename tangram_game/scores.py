@@ -53,12 +53,12 @@ def _of_puzzles(task: Place, played: Played) -> Scores:
     """The scores that the task declares."""
     every = summarise(task.layout, task.sim, played, own_reward=False, outlines=task.outlines)
     own: Scores = {one.name: every[one.name] for one in task.scores if one.name in every}
-    return own | {"episodes": float(len(played.overlap))} | of_several(played)
+    return own | {"episodes": float(len(played.coverage))} | of_several(played)
 
 
 def of_each(played: Played) -> Scores:
     """The coverage of each episode, to compare policies episode by episode."""
-    return {"coverage_each": np.round(played.overlap, 6).tolist()}
+    return {"coverage_each": np.round(played.coverage, 6).tolist()}
 
 
 def of_several(played: Played) -> Scores:

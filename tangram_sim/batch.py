@@ -36,7 +36,7 @@ class StepResult:
 
     Attributes:
         rewards: (B,) by the configured reward function.
-        overlap: (B,) coverage in [0, 1] on exact polygons.
+        coverage: (B,) covered share of the target in [0, 1] on exact polygons.
         camera_rewards: (B,) rewards by Eq. 14 on the pictures; None with the camera off.
         refused: (B,) whether the action named a placed token; then nothing moved.
         blocked: (B,) whether the token would have covered others too much; then nothing moved.
@@ -47,7 +47,7 @@ class StepResult:
     """
 
     rewards: Floats
-    overlap: Floats
+    coverage: Floats
     camera_rewards: Floats | None
     refused: Bools
     blocked: Bools
@@ -239,7 +239,7 @@ class BatchedEnv:
         share = covered_share(self.corners, self.goals, self.layout)
         return StepResult(
             rewards=self._rewards(share, camera),
-            overlap=share,
+            coverage=share,
             camera_rewards=camera,
             refused=refused,
             blocked=blocked,

@@ -82,13 +82,13 @@ class Jobs:
                 except TimeoutError:
                     self._renew(pool)
                     raise TangramError(
-                        f"it took more than {LIMIT_S:g} s: make it simpler"
+                        f"no answer within {LIMIT_S:g} s: try a simpler figure"
                     ) from None
                 except asyncio.CancelledError:
                     # Another task's timeout ended the pool; this task was not cancelled itself.
                     if future is None or not future.cancelled() or _is_cancelled():
                         raise
-            raise TangramError("the process that worked on it ended: make it simpler")
+            raise TangramError("the process that worked on it ended: try a simpler figure")
         finally:
             self._turns.release()
 

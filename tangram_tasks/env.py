@@ -66,12 +66,12 @@ class PlaceEnv(Env):
         return seen | {"goals": world.seen_goals}
 
     def facts(self) -> Arrays:
-        """Exact corners and goals, overlap, refused and blocked actions, and what cameras saw."""
+        """Exact corners and goals, coverage, refused and blocked actions, and what cameras saw."""
         world, result, none = self.world, self._result, np.zeros(self.count, np.bool_)
         facts: dict[str, Array] = {
             "corners": world.corners,
             "goals": world.goals,
-            "overlap": np.zeros(self.count) if result is None else result.overlap,
+            "coverage": np.zeros(self.count) if result is None else result.coverage,
             "refused": none if result is None else result.refused,
             "blocked": none if result is None else result.blocked,
         }
@@ -89,10 +89,10 @@ class PlaceEnv(Env):
         world, result = self.world, self._result
         if result is None:
             return {}
-        share, token = float(result.overlap[0]), int(result.tokens[0])
+        share, token = float(result.coverage[0]), int(result.tokens[0])
         solved = share
         if self._outlines:
-            solved = float(iou(world.layout, world.corners, result.overlap)[0])
+            solved = float(iou(world.layout, world.corners, result.coverage)[0])
         info: Json = {"coverage": share, "is_success": solved >= SOLVED}
         if result.camera_rewards is not None:
             info["reward_camera"] = float(result.camera_rewards[0])

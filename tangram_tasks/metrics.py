@@ -1,4 +1,4 @@
-"""Scores of played episodes: overlap, errors of position and angle, and faults in figures.
+"""Scores of played episodes: coverage, errors of position and angle, and faults in figures.
 
 Legend: E episodes, T steps, K tokens, V corners.
 """
@@ -58,10 +58,10 @@ def summarise(
     position, angle = pose_errors(layout, played.ends, played.goals)
     dense = make_reward(RewardConfig("dense"), layout, sim)
     scores = {
-        "mean_reward": float(np.mean(2.0 * played.overlap - 1.0)),
+        "mean_reward": float(np.mean(2.0 * played.coverage - 1.0)),
         "mean_reward_dense": float(np.mean(dense(played.ends, played.goals))),
-        "coverage": float(np.mean(played.overlap)),
-        "coverage_p10": float(np.percentile(played.overlap, 10)),
+        "coverage": float(np.mean(played.coverage)),
+        "coverage_p10": float(np.percentile(played.coverage, 10)),
         "angle_error_deg_median": float(np.median(angle)),
         "angle_error_deg_p90": float(np.percentile(angle, 90)),
         "position_error_median": float(np.median(position)),

@@ -36,7 +36,7 @@ class Played:
         episodes: corners and goals as the policy saw them, its actions and their rewards.
         corners: (E, T + 1, V, 2) exact corners, before each step and after the last.
         goals: (E, V, 2) exact corners of the targets.
-        overlap: (E,) coverage of exact polygons after the last step.
+        coverage: (E,) covered share of exact polygons after the last step.
         refused: (E, T) whether the action chose a placed token.
         blocked: (E, T) whether a token could not be set down because it would lie on others.
         seconds: (E,) wall time of choosing and moving; episodes played together share it equally.
@@ -48,7 +48,7 @@ class Played:
     episodes: Episodes
     corners: Floats
     goals: Floats
-    overlap: Floats
+    coverage: Floats
     refused: Bools
     blocked: Bools
     seconds: Floats
@@ -74,7 +74,7 @@ class Played:
             episodes=played.episodes,
             corners=facts["corners"],
             goals=facts["goals"][:, 0],
-            overlap=facts["overlap"][:, -1],
+            coverage=facts["coverage"][:, -1],
             refused=facts["refused"][:, 1:],
             blocked=facts["blocked"][:, 1:],
             seconds=played.seconds,

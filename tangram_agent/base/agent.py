@@ -51,10 +51,10 @@ class TokenAgent(Agent):
 
 
 def seen_tokens(task: Task, kind: str) -> Place:
-    """The task, if it has tokens and shows the pieces of its target.
+    """The task as one of tokens whose target shows its pieces.
 
     Raises:
-        ConfigError: it is another task; names the agent and the remedy.
+        ConfigError: it is another task; names the agent (`kind`) and the remedy.
     """
     if not isinstance(task, Place) or task.outlines:
         raise ConfigError(

@@ -109,7 +109,7 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class WantWeights(Message):
-    """A worker asks for the newest weights, unless it has these: its epoch and version."""
+    """A worker asks for newer weights than its own, which `epoch` and `version` name."""
 
     kind: ClassVar[str] = "want_weights"
     epoch: Id

@@ -46,7 +46,7 @@ class Show:
 
     def told(self) -> str:
         """Number of episodes, mean score and note, as one line of text."""
-        mean = float(self.played.overlap.mean())
+        mean = float(self.played.coverage.mean())
         note = f"; {self.note}" if self.note else ""
         return f"{plural(len(self.titles), self.kind)}, coverage {decimal(mean)}{note}"
 

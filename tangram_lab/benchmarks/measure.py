@@ -118,7 +118,7 @@ def told(row: Row) -> Row:
 
 
 def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print rows with equal keys as a table."""
+    """Print rows as a table; all have the same keys, its columns."""
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
         table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")

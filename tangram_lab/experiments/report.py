@@ -10,6 +10,7 @@ from matplotlib.figure import Figure as Canvas
 
 from tangram_agent.runs import read_config
 from tangram_core.errors import RunError
+from tangram_core.scores import decimal
 from tangram_core.store.files import write_whole
 from tangram_core.store.stored import CONFIG
 from tangram_lab.experiments.rows import AGENT, RUN, SCORES, Spread, of_a_study, read_rows, spreads
@@ -53,7 +54,7 @@ def shown(spread: Spread, measure: str) -> str:
     """A spread as text: median (least to most), or one number if all seeds agree."""
 
     def text(value: float) -> str:
-        return f"{value:,.0f}" if measure in WHOLE else f"{value:.4f}"
+        return f"{value:,.0f}" if measure in WHOLE else decimal(value, 4)
 
     median, least, most = map(text, spread)
     return median if least == most else f"{median} ({least} to {most})"

@@ -93,7 +93,7 @@ def of_a_study(rows: pd.DataFrame) -> bool:
 
 
 def spreads(rows: pd.DataFrame, measure: str) -> dict[tuple[str, str, str], Spread]:
-    """(training, test, policy) -> spread of a score over the seeds; only groups that have it."""
+    """(training, test, policy) -> spread of a score over the seeds, where it was measured."""
     known = rows.dropna(subset=[measure])
     groups = known.groupby(["training", "test", "policy"], sort=False)[measure]
     found = groups.agg(["median", "min", "max"])

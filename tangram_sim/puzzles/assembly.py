@@ -77,12 +77,12 @@ class Puzzle:
 
     @property
     def corners(self) -> Floats:
-        """(V, 2) of the tans in the figure."""
+        """Corners (V, 2) of the tans, in arena units."""
         return self.layout.corners(self.poses)
 
 
 def build_puzzle(sketch: Sketch, rules: PuzzleRules) -> tuple[Puzzle | None, list[str]]:
-    """The exact figure of a drawing and no faults, or None and the faults."""
+    """(figure, []) if a drawing keeps the rules, else (None, its faults)."""
     where = f"puzzle '{sketch.name}'"
     fits = [fit_piece(kind, corners) for kind, corners in sketch.pieces]
     faults = _count_faults(sketch, rules, where) + _fit_faults(sketch, fits, where)

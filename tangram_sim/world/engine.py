@@ -15,7 +15,7 @@ class Client:
     """A new PyBullet client in DIRECT mode; base class of all that moves bodies.
 
     Attributes:
-        client: number of the client.
+        client: PyBullet's id of this client, its `physicsClientId`.
     """
 
     def __init__(self) -> None:

@@ -269,7 +269,7 @@ class Studio {
     $("seen-pieces").replaceChildren(...answer.pieces.map((piece, k) => make("polygon", {
       points: piece.map((point) => point.join(",")).join(" "), fill: this.board.tokens[k].colour,
     })));
-    const share = `The red dashes are your figure; the overlap (IoU) is ${per_cent(answer.iou)}.`;
+    const share = `The red dashes are your figure; its IoU, shared area over united area, is ${per_cent(answer.iou)}.`;
     $("told").textContent = answer.exact
       ? `What the agent sees, and where the tans go: ${answer.how}.`
       : `Seven tans do not fill it; this is the nearest figure found. ${share} ${answer.how}`;

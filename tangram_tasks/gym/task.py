@@ -26,7 +26,7 @@ SUCCESS = "is_success"  # key in gymnasium's info and in `Env.facts`
 class GymConfig(Settings, section="task"):
     """The environment of gymnasium that is played, and how its episodes end and begin."""
 
-    id: str = setting("", "the environment's id at gymnasium, such as FetchReach-v4", part=NETWORK)
+    id: str = setting("", "gymnasium's id of the environment, such as FetchReach-v4", part=NETWORK)
     imports: tuple[str, ...] = setting(
         (),
         "modules that register environments, imported first: gymnasium_robotics, panda_gym",

@@ -125,9 +125,9 @@ class Push(Task):
     agent: ClassVar[str] = "push"
     sections: ClassVar = {"tokens": TokensConfig, "task": PushConfig}
     scores: ClassVar = (
-        Score("solved", "all in place"),
+        Score("solved", "solved (all in place)"),
         Score("placed", "tokens in place"),
-        Score("coverage", "covered"),
+        Score("coverage", "coverage"),
         Score("pushes", "pushes", digits=1),
         Score("refused", "pushes refused", digits=2),
     )

@@ -88,8 +88,8 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
     smallest = float(np.sqrt(layout.areas.min()) * unit)
     if smallest < _SMALL:
         raise LackingError(
-            f"{source} shows tokens too small: the smallest is about {smallest:.1f} pixels wide, "
-            f"and {_SMALL:g} are needed: take it from nearer, or with more pixels",
+            f"the tokens in {source} are too small: the smallest is about {smallest:.1f} pixels "
+            f"wide, and {_SMALL:g} are needed: take it from nearer, or with more pixels",
             len(spots.boxes),
         )
     part, corner = spots.cut_out()

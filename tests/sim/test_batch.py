@@ -76,7 +76,7 @@ def test_every_pose_is_reached_in_one_action(backend: str, arena: float) -> None
     actions = onto(env)
     assert np.abs(actions).max() <= 1.0
     result = env.step(actions)
-    np.testing.assert_allclose([result.overlap, result.rewards], 1.0, atol=1e-6)
+    np.testing.assert_allclose([result.coverage, result.rewards], 1.0, atol=1e-6)
     assert result.done
     env.close()
 

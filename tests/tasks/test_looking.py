@@ -108,7 +108,7 @@ def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
         ] / 2.0
         result = env.step(np.column_stack([way, np.zeros(4)]))
         np.testing.assert_array_equal(result.rewards, result.camera_rewards)
-        assert np.abs(result.rewards - (2.0 * result.overlap - 1.0)).max() > 1e-4
+        assert np.abs(result.rewards - (2.0 * result.coverage - 1.0)).max() > 1e-4
 
 
 def test_alike_tokens_are_moved_where_they_are_seen() -> None:

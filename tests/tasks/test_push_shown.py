@@ -213,7 +213,7 @@ def test_play_takes_puzzles_of_pushes(run: Path, tmp_path: Path) -> None:
     told = [f"run_dir={run}", "puzzle=[cat]", "episodes=2"]
     for name in ("cat.png", "cat.json"):
         status, out, _ = here("tangram-play", *told, f"out={tmp_path / name}", cwd=tmp_path)
-        assert (status, "all in place 0.000, tokens in place" in out) == (0, True)
+        assert (status, "solved (all in place) 0.000, tokens in place" in out) == (0, True)
     plan = json.loads((tmp_path / "cat.json").read_text())
     assert len(plan["tokens"]) == 7
     Image.open(tmp_path / "cat.png").verify()

@@ -204,7 +204,7 @@ CASES: dict[str, tuple[Given, ...]] = {
         png(photograph()),
         png(photograph(count=6), how=take_for_one_figure),
     ),
-    "tokens too small: .*: take it from nearer, or with more pixels; or set silhouette=": (
+    "are too small: .*: take it from nearer, or with more pixels; or set silhouette=": (
         png(photograph(unit=30.0)),
         png(photograph()),
         png(photograph(unit=30.0), how=take_for_one_figure),

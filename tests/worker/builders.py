@@ -72,7 +72,7 @@ def ended(layout: Layout, corners: Floats, goals: Floats, **more: Any) -> Played
         "terminated": np.zeros((count, steps), np.uint8),
     }
     known = {
-        "overlap": np.zeros(count),
+        "coverage": np.zeros(count),
         "refused": np.zeros((count, steps), np.bool_),
         "blocked": np.zeros((count, steps), np.bool_),
         "seconds": np.ones(count),

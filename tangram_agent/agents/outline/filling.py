@@ -119,7 +119,7 @@ class Filling:
         return tuple(np.bincount(self.shape_of[tokens], minlength=self.shapes).tolist())
 
     def inside(self, corners: AnyArray, outline: AnyArray) -> Bools:
-        """(K,) whether tokens with corners (V, 2) lie in an outline (G, 2) by at least 90 %."""
+        """(K,) whether at least 90 % of each token, by corners (V, 2), is in the outline (G, 2)."""
         area = as_area(outline)
         own = outlines(np.asarray(corners, np.float64)[None], self._layout)[0]
         shared = shapely.area(shapely.intersection(shapely.polygons(own), area))

@@ -106,7 +106,7 @@ class Tokens:
         return (far <= self.within) & (left[..., 2].abs() <= self.turned)
 
     def wrapped(self, angles: Tensor, which: Tensor) -> Tensor:
-        """The smallest turns (...) with the same result as the given angles."""
+        """The smallest turns (...) after which tokens look as after the given angles."""
         period = self.periods[which]
         return angles - period * torch.round(angles / period)
 

@@ -64,7 +64,7 @@ class Seen:
 
 
 def beside(scene: Scene, slots: Tensor) -> Tensor:
-    """Slots (n,) of the other token nearest to the one in each of `slots` (n,), or to its goal.
+    """For each token in `slots` (n,), the slot of the other one nearest to it or to its goal.
 
     Without another token on the table: an absent token, or the token itself.
     """

@@ -96,7 +96,7 @@ def test_more_puzzles_than_are_played_at_a_time() -> None:
     made = game()
     figures = find_figures("train", made)
     played = play_figures(made, figures, lambda _: exact_policy(made.layout, made.sim), 0)
-    assert len(played.overlap) == len(figures) == 35
+    assert len(played.coverage) == len(figures) == 35
     goals = [made.layout.corners(one.poses, one.flipped) for one in figures]
     np.testing.assert_allclose(played.goals, np.stack(goals))
-    np.testing.assert_allclose(played.overlap, 1.0, atol=1e-5)
+    np.testing.assert_allclose(played.coverage, 1.0, atol=1e-5)

@@ -198,7 +198,7 @@ def test_flips_and_starts_on_any_side() -> None:
     env = env_of("parallelogram", count=64)
     assert 16 < env.layout.flipped(env.corners).sum() < 48
     assert not env.layout.flipped(env.goals).any()
-    np.testing.assert_allclose(env.step(onto_targets(env)).overlap, 1.0, atol=1e-9)
+    np.testing.assert_allclose(env.step(onto_targets(env)).coverage, 1.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("backend", ["physics", "kinematic"])

@@ -118,7 +118,7 @@ def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: boo
     with environment(made, 3) as env:
         given = env, made.spec, acting.actor.act, np.random.default_rng
         four, six = (Played.of(play(*given, count, facts=True)) for count in (4, 6))
-    assert len(four.overlap) == len(four.starts) == four.episodes.count == 4
+    assert len(four.coverage) == len(four.starts) == four.episodes.count == 4
     np.testing.assert_array_equal(four.corners, six.corners[:4])
     np.testing.assert_array_equal(four.episodes.actions, six.episodes.actions[:4])
     assert (four.camera is None) == (not camera)

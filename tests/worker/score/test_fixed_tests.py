@@ -28,8 +28,8 @@ def test_the_set_does_not_depend_on_how_many_play_at_a_time() -> None:
     expected = played(12, 4)
     for episodes, at_once in ((7, 3), (7, 7), (7, 50), (1, 1)):
         found = played(episodes, at_once)
-        assert len(found.overlap) == episodes
-        for name in ("corners", "goals", "overlap"):
+        assert len(found.coverage) == episodes
+        for name in ("corners", "goals", "coverage"):
             column = vars(expected)[name][:episodes]
             np.testing.assert_allclose(vars(found)[name], column, atol=1e-4, err_msg=name)
         actions = expected.episodes.actions[:episodes]
@@ -65,7 +65,7 @@ def test_the_camera_is_on_though_training_has_none() -> None:
         whole = tests.play(position_policy(made.task.layout, made.task.sim))
     found, scores = Played.of(whole), made.task.score(whole)
     assert found.camera is not None
-    np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
+    np.testing.assert_allclose(found.camera, 2.0 * found.coverage - 1.0, atol=0.1)
     assert scores["mean_reward_camera"] == pytest.approx(scores["mean_reward"], abs=0.03)
 
 
@@ -84,7 +84,7 @@ def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: b
     with closing(FixedTests(made.task, 3, 3)) as tests:
         whole = tests.play(greedy(policy(made).actor))
     found, scores = Played.of(whole), made.task.score(whole)
-    assert scores["mean_reward"] == pytest.approx(float(np.mean(2.0 * found.overlap - 1.0)))
+    assert scores["mean_reward"] == pytest.approx(float(np.mean(2.0 * found.coverage - 1.0)))
     assert ("mean_train_reward" in scores) == own
 
 

@@ -234,7 +234,7 @@ def eleven(camera: Floats | None) -> tuple[Layout, Played]:
     ends = at(layout, *[(0.01 * i, 0.0, i) for i in steps])
     rewards = (steps[:, None] / 100.0).astype(np.float32)
     path = np.stack([goals + 1.0, ends], axis=1)
-    more = {"rewards": rewards, "overlap": steps / 10.0, "camera": camera}
+    more = {"rewards": rewards, "coverage": steps / 10.0, "camera": camera}
     return layout, ended(layout, path, goals, **more)
 
 

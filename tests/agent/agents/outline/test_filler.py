@@ -51,7 +51,7 @@ def overlaps(made: Setup, value: nn.Module, targets: Any = None, count: int = 6)
             result = env.step(policy.act(env.seen, env.closed, env.seen_goals))
             assert not result.blocked.any()
             assert not result.refused.any()
-    return np.asarray(result.overlap)
+    return np.asarray(result.coverage)
 
 
 def test_a_place_is_taken_exactly() -> None:

@@ -83,7 +83,7 @@ def coverage(learner: PairLearner, made: Setup, episodes: int) -> float:
         for _ in range(env.horizon):
             actions = policy.act(env.corners, env.placed, env.goals)
             result = env.step(actions.astype(np.float64))
-    return float(result.overlap.mean())
+    return float(result.coverage.mean())
 
 
 def test_it_learns_to_assemble_two_tokens() -> None:

@@ -163,7 +163,7 @@ def assembled(made: Setup, chooser: Planner, episodes: int) -> tuple[np.ndarray,
             flips.append(actions[:, -4] > 0.0)
             result = env.step(actions.astype(np.float64))
             assert not result.refused.any()
-        return result.overlap, np.stack(flips, axis=1)
+        return result.coverage, np.stack(flips, axis=1)
 
 
 @pytest.mark.parametrize(
