@@ -78,11 +78,8 @@ def fill(asked: Fill) -> Answer:
     Raises:
         ConfigError: the silhouette has no area, or its figure reaches out of the arena.
     """
-    count = sum(one is not None for one in (asked.puzzle, asked.outlines, asked.pieces))
-    if count != 1:
-        raise ConfigError(
-            f"a request needs exactly one of puzzle, outlines and pieces, got {count}: send one"
-        )
+    if sum(one is not None for one in (asked.puzzle, asked.outlines, asked.pieces)) != 1:
+        raise ConfigError("send exactly one of puzzle, outlines and pieces")
     layout, scale = player().layout, player().run.task.tokens.scale
     if asked.puzzle is not None:
         load_puzzle(asked.puzzle)  # a name of the library, not of a file

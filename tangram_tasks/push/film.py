@@ -51,10 +51,7 @@ class Replayed:
         return None if push.refused else push
 
     def followed(self, table: PushTable, number: int, path: Floats) -> list[Floats]:
-        """All tokens' corners (V, 2) at each point of a finger's path, replayed on `table`.
-
-        They are shifted, later ones more, so that the last ones are those recorded.
-        """
+        """Corners (V, 2) of all tokens along a finger's path, shifted to end as recorded."""
         layout = self.task.layout
         table.place(layout.poses(self.corners[number]), self.present, self.unknowns)
         found = [self.corners[number] for _ in path]
