@@ -160,5 +160,5 @@ class Ddpg(TokenLearner):
             yield replace(seen, acts=acts)
 
     def if_any_follows(self, done: npt.NDArray[Any], follow: Any) -> Any:
-        """The next views if the critic's target counts any of them, else None."""
+        """The views after the steps; None if no value of the batch counts what follows."""
         return follow if self.bootstraps and not done.all() else None

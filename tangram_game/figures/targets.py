@@ -34,7 +34,7 @@ def told_apart(target: str, task: Place) -> str:
     if not path.suffix and not path.is_file():
         return PUZZLE
     if not path.suffix:
-        raise ConfigError(f"{source} has no ending: name a picture {path.name}.png, say")
+        raise ConfigError(f"{source} has no ending: rename it, a picture to {path.name}.png")
     check_file(path, source)
     if path.suffix.lower() == ".json":
         content = loaded(read_text(path, source), source)

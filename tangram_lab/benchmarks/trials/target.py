@@ -90,7 +90,7 @@ class Target:
 
     @cached_property
     def setup(self) -> Setup:
-        """The setup of the run."""
+        """Task, agent and service of the run, from its config."""
         return make_setup(yaml.safe_load((self.folder / "config.yaml").read_text()))
 
     @property
