@@ -100,7 +100,10 @@ TIGHT = picture([[[0, 0], [1, 0], [0.5, 0.5]]]).crop((32, 80, 129, 129))
 CASES: dict[str, tuple[Given, ...]] = {
     **{told: (file(edited(*edit)), file(edit[0])) for told, edit in EDITS.items()},
     "is no file: check the path": (svg(None), svg(SVG)),
-    "it has no ending: rename it, a picture to it.png": (Given("it", encoded(picture(), "PNG")), PNG),
+    "it has no ending: rename it, a picture to it.png": (
+        Given("it", encoded(picture(), "PNG")),
+        PNG,
+    ),
     "cannot be read .*: give a copy that you may": (svg(Path("/proc/self/mem")), svg(SVG)),
     "larger than .*: split it, or give a PNG": (file(LONG), file(PUZZLES), PNG),
     "longer than .*: split it": (file(LONG, how=parse), file(PUZZLES, how=parse)),
